@@ -26,7 +26,6 @@ fn main() -> Result<(), Failure> {
     println!("cargo:rerun-if-changed=build");
     println!("cargo:rerun-if-changed=glsl");
     println!("cargo:rerun-if-env-changed=SHADERC_LIB_DIR");
-    println!("cargo:rustc-env=NERTCA_COMMIT={}", commit());
     let out = PathBuf::from(env::var("OUT_DIR")?);
     write_shaders(Path::new("glsl"), &out)
 }
@@ -59,20 +58,4 @@ fn write_shaders(glsl: &Path, out: &Path) -> Result<(), Failure> {
         fs::write(out.join(format!("constants_{name}.rs")), generate::constants(&constants))?;
     }
     Ok(())
-}
-
-/// Commit of the checkout, for benchmark reports; "unknown" outside one.
-fn commit() -> String {
-    // This file changes with every commit and checkout, but not with edits: a build of edited sources names the commit they are
-    // based on.
-    if let Some(log) = git(&["rev-parse", "--git-path", "logs/HEAD"]).filter(|log| Path::new(log).exists()) {
-        println!("cargo:rerun-if-changed={log}");
-    }
-    git(&["describe", "--always", "--dirty"]).unwrap_or_else(|| "unknown".to_owned())
-}
-
-/// Returns the output of a git command; none when it fails or git is missing.
-fn git(args: &[&str]) -> Option<String> {
-    let output = std::process::Command::new("git").args(args).output().ok().filter(|output| output.status.success())?;
-    Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }

@@ -171,7 +171,7 @@ impl Checkpoint {
     /// # Errors
     /// [`Error::Io`].
     pub fn write(&self, path: &Path) -> Result<()> {
-        files::write_atomic(path, &self.to_bytes()?)
+        Ok(files::write_atomic(path, &self.to_bytes()?)?)
     }
 
     /// Returns the content of a checkpoint file.

@@ -40,8 +40,6 @@ mod tests {
     use crate::render::quantity::Projection;
     use crate::scan::dataset::Layout;
     use crate::scan::gating::BeatScaling;
-    #[cfg(feature = "study")]
-    use crate::study::scores::Score;
     use serde::Serialize;
 
     fn check_names_in_files<T: Choice + Serialize>() {
@@ -65,8 +63,6 @@ mod tests {
         check_names_in_files::<Layers>();
         check_names_in_files::<Layout>();
         check_names_in_files::<Setting>();
-        #[cfg(feature = "study")]
-        check_names_in_files::<Score>();
     }
 
     #[test]

@@ -12,7 +12,7 @@ pub mod method;
 mod nerf_ca;
 mod nert_ca;
 mod r2_gaussian;
-pub(crate) mod renamed;
+pub mod renamed;
 mod sax_nerf;
 mod section;
 pub mod sections;

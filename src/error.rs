@@ -1,5 +1,6 @@
 //! The error type of the crate, with one variant per case that a caller can handle.
 
+use nertca_vk_formats as formats;
 use nertca_vk_gpu as gpu;
 use std::path::{Path, PathBuf};
 
@@ -123,6 +124,18 @@ impl Error {
     pub fn io(action: &'static str, path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.as_ref().to_path_buf();
         move |source| Error::Io { action, path, source }
+    }
+}
+
+impl From<formats::error::Error> for Error {
+    fn from(error: formats::error::Error) -> Error {
+        use formats::error::Error as Files;
+        match error {
+            Files::Data { file, field, problem } => Error::Data { file, field, problem },
+            Files::Io { action, path, source } => Error::Io { action, path, source },
+            Files::Internal(fault) => Error::Internal(fault),
+            other => Error::Internal(other.to_string()),
+        }
     }
 }
 

@@ -6,7 +6,7 @@
 //! `R = Rz(-primary) Rz(90 deg) Rx(secondary) Rx(-90 deg)`. Directions have unit depth, not unit
 //! length; depth is counted from the isocentre plane.
 
-use glam::{DMat3, DVec3};
+use glam::{DAffine3, DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 
 /// One world unit in mm.
@@ -20,6 +20,16 @@ pub fn world_from_lps_mm(lps: DVec3) -> DVec3 {
 /// Patient vector in mm (left, posterior, superior) of a world vector.
 pub fn lps_mm_from_world(world: DVec3) -> DVec3 {
     DVec3::new(world.y, world.x, world.z) * MM_PER_UNIT
+}
+
+/// Returns the transform from world units to voxel index of a transform from voxel index to patient mm (LPS).
+pub fn world_to_index(index_to_lps: &DAffine3) -> DAffine3 {
+    let columns = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| world_from_lps_mm(index_to_lps.matrix3 * axis));
+    let index_to_world = DAffine3::from_mat3_translation(
+        DMat3::from_cols(columns[0], columns[1], columns[2]),
+        world_from_lps_mm(index_to_lps.translation),
+    );
+    index_to_world.inverse()
 }
 
 /// How an image was taken.
@@ -295,6 +305,15 @@ impl ViewRays {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::formats::volume::Volume;
+
+    #[test]
+    fn world_axes_are_posterior_left_superior() {
+        let volume = Volume::centred([2, 3, 4], 1.5, DVec3::new(1.0, -2.0, 3.0), vec![0.0; 24]);
+        // Voxel (0,0,0) sits at LPS (0.25, -3.5, 0.75): world = (P, L, S) / 100.
+        let index = world_to_index(&volume.index_to_lps).transform_point3(DVec3::new(-0.035, 0.0025, 0.0075));
+        assert!(index.length() < 1e-9, "{index}");
+    }
 
     /// Returns a projection matrix with these rays; its sign can be chosen.
     pub(crate) fn matrix_of(rays: &ViewRays) -> Geometry {

@@ -15,10 +15,10 @@
 //! 7. [`export`] writes them for other tools, [`score`] compares them with the images, [`trees`] extracts centrelines from them
 //!
 //! [`run`] connects these to a run directory, [`session`] is a reconstruction in memory to which frames can be added, and
-//! [`capi`] is its C interface. [`phantom`] makes synthetic data, `study` (a feature) compares methods on them, [`mod@bench`]
-//! measures the speed, and [`mod@reference`] holds an f64 reference of every compute stage, with which tests and `selftest`
+//! [`capi`] is its C interface. [`phantom`] makes synthetic data, [`mod@bench`] measures the speed, and [`mod@reference`] holds an f64 reference of every compute stage, with which tests and `selftest`
 //! compare the device; `inventory` lists pipelines as drivers compile them (both belong to the feature `diagnostics`). All of
-//! them build on the compute stages in [`kernels`] and on [`gpu`], which is Vulkan code independent of angiography. A module
+//! them build on the compute stages in [`kernels`] and on two crates that know nothing of angiography: [`gpu`], Vulkan compute, and
+//! [`formats`], files that other tools read and write. A module
 //! uses only modules that stand above it in this file.
 //!
 //! The following example turns a dataset into a reconstruction in memory:
@@ -80,14 +80,16 @@
 
 pub mod choice;
 pub mod error;
-pub mod files;
 pub mod fingerprint;
 pub mod random;
-pub mod raster;
 pub mod tensors;
 
 /// Vulkan compute, independent of angiography: a crate of its own.
 pub use nertca_vk_gpu as gpu;
+
+/// Files that other tools read and write: a crate of its own.
+pub use nertca_vk_formats as formats;
+pub use nertca_vk_formats::{files, raster};
 
 pub mod config;
 pub mod geometry;
@@ -101,26 +103,6 @@ pub mod kernels {
     pub mod push;
     pub mod stages;
     pub mod tuning;
-}
-
-/// Files that other tools read and write.
-pub mod formats {
-    pub mod gltf;
-    pub mod image_limits;
-    pub mod images;
-    pub mod mesh;
-    pub mod metaimage;
-    pub mod nifti;
-    pub mod npy;
-    pub mod nrrd;
-    pub mod png;
-    pub mod raw;
-    pub mod swc;
-    pub mod volume;
-    pub mod volume_files;
-    pub mod vtk;
-    mod vtk_arrays;
-    pub mod vtp;
 }
 
 /// Angiograms with their geometry and phase.
@@ -315,9 +297,6 @@ pub mod capi {
     pub mod truth;
     pub mod types;
 }
-
-#[cfg(feature = "study")]
-pub mod study;
 
 pub mod bench;
 

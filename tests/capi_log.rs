@@ -3,9 +3,10 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 #![allow(clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
-mod capi;
+#[path = "common/c_scene.rs"]
+mod c_scene;
 
-use capi::scene::ok;
+use c_scene::ok;
 use nertca_vk::capi::context::*;
 use nertca_vk::capi::log::NERTCA_LOG_WARNING;
 use nertca_vk::capi::types::*;

@@ -30,12 +30,12 @@ def cargo_metadata():
 def linked_packages(metadata):
     """Packages reached from ours through normal dependencies, without ours."""
     nodes = {node["id"]: node for node in metadata["resolve"]["nodes"]}
-    root = metadata["resolve"]["root"]
-    found, waiting = set(), [root]
+    ours = set(metadata["workspace_members"])
+    found, waiting = set(), list(ours)
     while waiting:
         for dependency in nodes[waiting.pop()]["deps"]:
             normal = any(kind["kind"] is None for kind in dependency["dep_kinds"])
-            if normal and dependency["pkg"] not in found:
+            if normal and dependency["pkg"] not in found | ours:
                 found.add(dependency["pkg"])
                 waiting.append(dependency["pkg"])
     packages = [package for package in metadata["packages"] if package["id"] in found]

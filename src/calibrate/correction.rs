@@ -91,7 +91,7 @@ impl Calibration {
     /// # Errors
     /// [`Error::Io`].
     pub fn write(&self, directory: &Path) -> Result<()> {
-        files::write_atomic(&directory.join(FILE), files::pretty_json(self)?.as_bytes())
+        Ok(files::write_atomic(&directory.join(FILE), files::pretty_json(self)?.as_bytes())?)
     }
 
     /// Reads the calibration of a run; `None` where the run has none.

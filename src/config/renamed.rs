@@ -62,7 +62,7 @@ const RENAMED: &[(&str, &str, &str)] = &[
 ];
 
 /// Returns the present name of a key such as `r2.most`.
-pub(crate) fn current(key: &str) -> String {
+pub fn current(key: &str) -> String {
     let Some((section, name)) = key.split_once('.') else { return key.to_owned() };
     let found = RENAMED.iter().find(|(of, earlier, _)| *of == section && *earlier == name);
     found.map_or(key.to_owned(), |(section, _, now)| format!("{section}.{now}"))
@@ -79,8 +79,7 @@ pub(super) fn rename(table: &mut toml::Table) {
 }
 
 /// Returns the earlier name of a key of a section; `None` for a key that was not renamed.
-#[cfg(feature = "study")]
-pub(crate) fn earlier(section: &str, key: &str) -> Option<&'static str> {
+pub fn earlier(section: &str, key: &str) -> Option<&'static str> {
     RENAMED.iter().find(|(of, _, now)| *of == section && *now == key).map(|(_, earlier, _)| *earlier)
 }
 

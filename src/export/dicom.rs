@@ -84,7 +84,7 @@ pub fn write(path: &Path, view: &DicomView<'_>) -> Result<()> {
     let file = object.with_meta(meta).map_err(|e| failed(&e))?;
     let mut bytes = Vec::new();
     file.write_all(&mut bytes).map_err(|e| failed(&e))?;
-    files::write_atomic(path, &bytes)
+    Ok(files::write_atomic(path, &bytes)?)
 }
 
 fn text(object: &mut InMemDicomObject, tag: Tag, vr: VR, value: &str) {

@@ -131,7 +131,7 @@ impl MotionExport<'_> {
     }
 
     fn write_nrrd(&self, path: &Path) -> Result<()> {
-        files::write_atomic_with(path, |file| {
+        Ok(files::write_atomic_with(path, |file| {
             file.write_all(&nrrd::vector_header_of(&self.header(), self.encoding, &[CAVEAT]))?;
             match self.encoding {
                 Encoding::Raw => self.write_phases(file),
@@ -141,7 +141,7 @@ impl MotionExport<'_> {
                     gzip.finish().map(drop)
                 }
             }
-        })
+        })?)
     }
 
     fn write_phases(&self, out: &mut dyn Write) -> std::io::Result<()> {
@@ -201,5 +201,5 @@ pub fn write_trajectories(deformable: &DeformableGaussians, path: &Path) -> Resu
         PointValues { name: "scale_mm", width: 3, values: scale_mm },
         PointValues { name: "attenuation_per_mm", width: 1, values: attenuation },
     ];
-    files::write_atomic_with(path, |out| lines.write(out))
+    Ok(files::write_atomic_with(path, |out| lines.write(out))?)
 }

@@ -106,7 +106,8 @@ pub fn write_meshes(
                 MeshFormat::Ply => mesh.to_ply(),
                 _ => mesh.to_obj(),
             };
-            files::write_atomic(&file, &bytes).map(|()| file)
+            files::write_atomic(&file, &bytes)?;
+            Ok(file)
         })
         .collect()
 }

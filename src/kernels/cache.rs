@@ -10,7 +10,7 @@ use crate::gpu::device::Gpu;
 /// [`crate::error::Error::Io`] when the directory cannot be written; device errors.
 pub fn save_pipeline_cache(gpu: &Gpu) -> Result<()> {
     match gpu.pipeline_cache()? {
-        Some((file, content)) => files::write_atomic(file, &content),
+        Some((file, content)) => Ok(files::write_atomic(file, &content)?),
         None => Ok(()),
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::error::Result;
 use crate::formats::volume::Volume;
-use crate::geometry::{MM_PER_UNIT, ViewRays};
+use crate::geometry::{MM_PER_UNIT, ViewRays, world_to_index};
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
@@ -62,7 +62,7 @@ impl Projector {
         let integrals = self.gpu.buffer("integrals", (views.len() * pixels * 4) as u64, Memory::Device)?;
         let mut volume = loaded.volume.clone();
         volume.index_to_lps.translation += shift_mm;
-        let to_index = volume.world_to_index();
+        let to_index = world_to_index(&volume.index_to_lps);
         let [row_x, row_y, row_z] = [0, 1, 2].map(|r| {
             let row = to_index.matrix3.row(r);
             [row.x as f32, row.y as f32, row.z as f32, to_index.translation[r] as f32]

@@ -160,12 +160,12 @@ impl Subject for Thorax {
         let moving = self.background(fraction, Breath::default());
         let values = self.still.values.iter().zip(&moving.values).map(|(a, b)| a + b).collect();
         let sum = Volume { values, ..moving };
-        nrrd::write(&directory.join(format!("background-{phase:02}.nrrd")), &sum, QUANTITY)
+        Ok(nrrd::write(&directory.join(format!("background-{phase:02}.nrrd")), &sum, QUANTITY)?)
     }
 }
 
 fn write_vessels(directory: &Path, phase: u32, vessels: &Volume) -> Result<()> {
-    nrrd::write(&truth_file(directory, phase), vessels, QUANTITY)
+    Ok(nrrd::write(&truth_file(directory, phase), vessels, QUANTITY)?)
 }
 
 /// A tree from a file, with a CT as its background if there is one.

@@ -40,7 +40,7 @@ impl TreeFile {
             "vtp" => TreeFile::of_lines(&[(path.to_path_buf(), vtp::read(path)?)])?,
             "pvd" => {
                 let phases = vtp::read_collection(path)?;
-                let lines = phases.into_iter().map(|file| vtp::read(&file).map(|lines| (file, lines)));
+                let lines = phases.into_iter().map(|file| -> Result<_> { Ok((file.clone(), vtp::read(&file)?)) });
                 TreeFile::of_lines(&lines.collect::<Result<Vec<_>>>()?)?
             }
             _ => serde_json::from_slice(&files::read_limited(path, 1 << 30)?)
@@ -118,7 +118,7 @@ impl TreeFile {
     /// [`Error::Io`].
     pub fn write(&self, path: &Path) -> Result<()> {
         let json = serde_json::to_string(self).map_err(|e| Error::Internal(e.to_string()))?;
-        files::write_atomic(path, json.as_bytes())
+        Ok(files::write_atomic(path, json.as_bytes())?)
     }
 
     /// Tree at a fraction (0 to 1) of its beat, by linear interpolation between the stored phases; the beat is cyclic.

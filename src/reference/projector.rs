@@ -1,7 +1,7 @@
 //! f64 projector, independent of the device's, with the device's sampling rule in plain loops.
 
 use crate::formats::volume::Volume;
-use crate::geometry::{MM_PER_UNIT, ViewRays};
+use crate::geometry::{MM_PER_UNIT, ViewRays, world_to_index};
 use crate::phantom::projector::{bounding_radius, depth_steps};
 use glam::DVec3;
 
@@ -28,7 +28,7 @@ pub fn trilinear(volume: &Volume, index: DVec3) -> f64 {
 
 /// Line integral of one pixel's ray, by the mid-points of equal depth steps of half a voxel.
 pub fn project_pixel(volume: &Volume, rays: &ViewRays, column: usize, row: usize) -> f64 {
-    let to_index = volume.world_to_index();
+    let to_index = world_to_index(&volume.index_to_lps);
     let half = bounding_radius(volume).min(rays.sod);
     let steps = depth_steps(volume, half);
     let (anchor, direction) = rays.pixel(column as f64, row as f64);

@@ -21,7 +21,7 @@ impl RunInfo {
     /// [`Error::Io`].
     pub fn write(&self, run: &Path) -> Result<()> {
         let text = crate::files::pretty_json(&self)?;
-        files::write_atomic(&run.join(Self::FILE), text.as_bytes())
+        Ok(files::write_atomic(&run.join(Self::FILE), text.as_bytes())?)
     }
 
     /// Reads the record from a run directory, or from the directory of a checkpoint.

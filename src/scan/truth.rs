@@ -93,7 +93,7 @@ impl Truth {
     /// # Errors
     /// [`Error::Io`] where it cannot be written.
     pub fn write(&self, dataset: &Path) -> Result<()> {
-        files::write_atomic(&dataset.join(TRUTH), files::pretty_json(self)?.as_bytes())
+        Ok(files::write_atomic(&dataset.join(TRUTH), files::pretty_json(self)?.as_bytes())?)
     }
 }
 

@@ -206,9 +206,9 @@ impl<'a> Writer<'a> {
     /// # Errors
     /// [`Error::Io`].
     pub fn finish(self) -> Result<()> {
-        let write = |name: &str, text: serde_json::Result<String>| {
+        let write = |name: &str, text: serde_json::Result<String>| -> Result<()> {
             let text = text.map_err(|e| Error::Internal(e.to_string()))?;
-            files::write_atomic(&self.out.join(name), text.as_bytes())
+            Ok(files::write_atomic(&self.out.join(name), text.as_bytes())?)
         };
         match self.layout {
             Layout::Native => write(MANIFEST, serde_json::to_string_pretty(&self.manifest)),

@@ -3,7 +3,7 @@
 use crate::error::Result;
 use crate::formats::volume::{Volume, VolumeHints};
 use crate::formats::volume_files;
-use crate::geometry::ViewRays;
+use crate::geometry::{ViewRays, world_to_index};
 use crate::scan::dataset::{Dataset, Frame};
 use crate::score::dice::{BestDice, mean, overlap};
 use crate::score::metrics;
@@ -65,7 +65,7 @@ pub fn truth_dice(
 
 /// Maximum attenuation of a volume along each ray of a view, per mm: `size` columns and rows, depths in world units.
 fn largest_per_mm(volume: &Volume, rays: &ViewRays, size: [usize; 2], depths: (f64, f64)) -> Vec<f32> {
-    let to_index = volume.world_to_index();
+    let to_index = world_to_index(&volume.index_to_lps);
     let pixel = |index: usize| {
         let (anchor, direction) = rays.pixel((index % size[0]) as f64, (index / size[0]) as f64);
         largest_along(volume, &to_index, (anchor, direction), depths)

@@ -96,7 +96,7 @@ pub fn write_comparison(path: &Path, frame: &Frame, seen: &Rendering, threshold:
         grey(&seen.dynamic_integral, Window { low: 0.0, ..Window::of(&seen.dynamic_integral) }),
         overlay,
     ]);
-    png::write(path, &DynamicImage::ImageRgb8(picture))
+    Ok(png::write(path, &DynamicImage::ImageRgb8(picture))?)
 }
 
 /// Writes an image, and a copy with the region that the hull covers in orange, where vessels may be. A vessel outside is
@@ -108,7 +108,7 @@ pub fn write_hull(path: &Path, integrals: &[f32], covered: &[bool], width: usize
     let codes = Window::of(integrals).codes(integrals);
     let plain = panel(width, |i| Rgb([codes[i]; 3]), codes.len());
     let tinted = |i: usize| if covered[i] { Rgb([240, codes[i] / 2 + 100, codes[i] / 3]) } else { Rgb([codes[i]; 3]) };
-    png::write(path, &DynamicImage::ImageRgb8(beside(&[plain, panel(width, tinted, codes.len())])))
+    Ok(png::write(path, &DynamicImage::ImageRgb8(beside(&[plain, panel(width, tinted, codes.len())])))?)
 }
 
 /// Writes a looping animation of grey images, `width` columns each, `ms` milliseconds apart.
@@ -130,7 +130,7 @@ pub fn write_gif(path: &Path, frames: &[Vec<f32>], width: usize, window: Window,
             encoder.encode_frame(image::Frame::from_parts(rgba, 0, 0, delay)).map_err(fault)?;
         }
     }
-    files::write_atomic(path, &bytes)
+    Ok(files::write_atomic(path, &bytes)?)
 }
 
 /// Writes the vessel pixels of a view before and after a correction, side by side: green where the other views show vessels
@@ -155,7 +155,7 @@ pub fn write_silhouettes(
         };
         panel(width, colour, seen.len())
     };
-    png::write(path, &DynamicImage::ImageRgb8(beside(&explained.map(side))))
+    Ok(png::write(path, &DynamicImage::ImageRgb8(beside(&explained.map(side))))?)
 }
 
 /// Writes one grey image.
@@ -164,5 +164,5 @@ pub fn write_silhouettes(
 /// [`Error::Io`].
 pub fn write_grey(path: &Path, values: &[f32], width: usize, window: Window) -> Result<()> {
     let codes = window.codes(values);
-    png::write(path, &DynamicImage::ImageRgb8(panel(width, |i| Rgb([codes[i]; 3]), values.len())))
+    Ok(png::write(path, &DynamicImage::ImageRgb8(panel(width, |i| Rgb([codes[i]; 3]), values.len())))?)
 }

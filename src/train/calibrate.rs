@@ -95,5 +95,5 @@ pub fn remember(cache: &Path, info: &DeviceInfo, config: &Config, verdict: Verdi
     all.insert(key(info, config), verdict);
     let text = crate::files::pretty_json(&all)?;
     files::create_directory(cache)?;
-    files::write_atomic(&cache.join(FILE), text.as_bytes())
+    Ok(files::write_atomic(&cache.join(FILE), text.as_bytes())?)
 }

@@ -143,12 +143,13 @@ fn write_phases(
 ) -> Result<Vec<PathBuf>> {
     let part = |part: Option<&std::ffi::OsStr>| part.unwrap_or_default().to_string_lossy().into_owned();
     let (stem, extension) = (part(path.file_stem()), part(path.extension()));
-    let write = |tree: &PhaseTree| {
+    let write = |tree: &PhaseTree| -> Result<PathBuf> {
         let file = match sequence {
             true => path.with_file_name(format!("{stem}_{:04}.{extension}", tree.phase)),
             false => path.to_path_buf(),
         };
-        files::write_atomic(&file, content(beat, tree).as_bytes()).map(|()| file)
+        files::write_atomic(&file, content(beat, tree).as_bytes())?;
+        Ok(file)
     };
     beat.phases.iter().map(write).collect()
 }

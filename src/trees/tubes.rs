@@ -20,7 +20,7 @@ const CORNERS: usize = 16;
 pub(super) fn to_glb(beat: &BeatTree) -> Result<Vec<u8>> {
     let Some(first) = beat.phases.first().filter(|_| beat.reference_phase.is_some()) else {
         let all = |tree: &PhaseTree| (tree.phase, joined(tree.branches.iter().map(|b| tube(b, &around(&b.points_mm)))));
-        return gltf::to_glb(&beat.phases.iter().map(all).collect::<Vec<_>>());
+        return Ok(gltf::to_glb(&beat.phases.iter().map(all).collect::<Vec<_>>())?);
     };
     let part = |(index, rest): (usize, &Branch)| {
         let (directions, rest_around) = (directions(&rest.points_mm), around(&rest.points_mm));
@@ -31,7 +31,7 @@ pub(super) fn to_glb(beat: &BeatTree) -> Result<Vec<u8>> {
         MovingMesh { name: format!("branch {index}"), phases: beat.phases.iter().map(at).collect() }
     };
     let parts: Vec<MovingMesh> = first.branches.iter().enumerate().map(part).collect();
-    gltf::to_moving_glb(&parts)
+    Ok(gltf::to_moving_glb(&parts)?)
 }
 
 /// Direction of a line at each of its points.

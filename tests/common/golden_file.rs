@@ -14,8 +14,8 @@ pub struct Golden {
 impl Golden {
     /// Reads `name`, a file made by `script`.
     pub fn open(name: &str, script: &str) -> Golden {
-        let path = format!("{}/tests/golden/{name}.safetensors", env!("CARGO_MANIFEST_DIR"));
-        let bytes = std::fs::read(&path).unwrap_or_else(|e| panic!("{path}: {e}; run {script}"));
+        let path = crate::root::root().join(format!("tests/golden/{name}.safetensors"));
+        let bytes = std::fs::read(&path).unwrap_or_else(|e| panic!("{}: {e}; run {script}", path.display()));
         let (_, metadata) = SafeTensors::read_metadata(&bytes).unwrap();
         let case = serde_json::from_str(&metadata.metadata().as_ref().unwrap()["case"]).unwrap();
         Golden { bytes, case }

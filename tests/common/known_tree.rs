@@ -1,11 +1,7 @@
 //! Known vessels, angiograms of them, and a short run on these, shared by tests of trees.
 #![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 
-#[path = "program.rs"]
-mod program;
-
-#[allow(unused_imports, reason = "not every test uses all")]
-pub use program::{program, whole_config};
+use crate::program::program;
 use serde_json::{Value, json};
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
@@ -71,7 +67,7 @@ pub fn ok(args: &[&str]) -> (String, String) {
 }
 
 pub struct Trained {
-    pub directory: tempfile::TempDir,
+    _directory: tempfile::TempDir,
     pub data: PathBuf,
     pub run: PathBuf,
 }
@@ -85,7 +81,7 @@ pub fn trained() -> &'static Trained {
         // The detector is off centre, so that errors in its handling are detected.
         phantom(&data, PHASES, &["--size", "64", "--offset", "2.5,-1.5"]);
         train(&data, &run, &["--iterations", "60", "--set", "gaussians.iterations=60", "--tree"]);
-        Trained { directory, data, run }
+        Trained { _directory: directory, data, run }
     })
 }
 

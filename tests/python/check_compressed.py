@@ -1,6 +1,6 @@
 """Opens compressed exports and compares them with the plain ones.
 
-    python3 check_compressed.py DIRECTORY   # made by tests/interop.rs
+    python3 check_compressed.py DIRECTORY   # made by tests/cli/interop.rs
 """
 import gzip
 import sys

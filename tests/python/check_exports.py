@@ -1,6 +1,6 @@
 """Opens every kind of file the program exports with the tool people would use, and compares values and geometry.
 
-    python3 check_exports.py DIRECTORY   # made by tests/interop.rs
+    python3 check_exports.py DIRECTORY   # made by tests/cli/interop.rs
 """
 import json
 import sys

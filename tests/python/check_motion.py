@@ -1,6 +1,6 @@
 """Opens exported motion with the tools people would use and with parsers of its own, and compares it with what moved.
 
-    python3 check_motion.py DIRECTORY   # made by tests/motion.rs
+    python3 check_motion.py DIRECTORY   # made by tests/cli/motion.rs
 """
 import gzip
 import json

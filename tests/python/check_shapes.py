@@ -1,6 +1,6 @@
 """Scores pairs of voxel sets with SciPy and scikit-image, and compares with what the program says of them.
 
-    python3 check_shapes.py DIRECTORY   # made by tests/volume_scores.rs
+    python3 check_shapes.py DIRECTORY   # made by tests/cli/volume_scores.rs
 """
 import json
 import sys

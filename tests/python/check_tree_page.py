@@ -1,6 +1,6 @@
 """Looks at a run's page in a browser that reaches nothing else: the tree lies on the angiograms, and clicks tell of branches.
 
-    python3 check_tree_page.py EXPECTED.json PICTURE.png   # made by tests/tree_pages.rs
+    python3 check_tree_page.py EXPECTED.json PICTURE.png   # made by tests/cli/tree_pages.rs
 """
 import base64
 import io

@@ -1,6 +1,6 @@
 """Scores a tree against the true one by SciPy's distances and projections of its own, and compares with what `eval` says.
 
-    python3 check_tree_scores.py DATA RUN   # made by tests/tree_pages.rs; RUN has tree.json and evaluation.json
+    python3 check_tree_scores.py DATA RUN   # made by tests/cli/tree_pages.rs; RUN has tree.json and evaluation.json
 """
 import json
 import sys

@@ -1,6 +1,6 @@
 """Opens trees with VTK and compares them with the true vessels by SciPy.
 
-    python3 check_trees.py DIRECTORY   # made by tests/trees.rs
+    python3 check_trees.py DIRECTORY   # made by tests/cli/trees.rs
 """
 import json
 import sys

@@ -1,6 +1,6 @@
 """Plays the tubes of a tree with VTK's glTF reader, and weighs them with trimesh: rings have the tree's radii around its points.
 
-    python3 check_tubes.py TUBES.glb TREE.json   # made by tests/trees.rs of the same phases
+    python3 check_tubes.py TUBES.glb TREE.json   # made by tests/cli/trees.rs of the same phases
 """
 import json
 import struct

@@ -1,6 +1,6 @@
 """Looks at the viewer's tree in a browser: points are where the engine sees them, and clicks tell lengths and diameters.
 
-    python3 check_viewer.py EXPECTED.json PICTURE.png   # made by tests/tree_pages.rs
+    python3 check_viewer.py EXPECTED.json PICTURE.png   # made by tests/cli/tree_pages.rs
 """
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Prints the SSIM that scikit-image gives a pair of images; tests/volume_scores.rs compares it with ours."""
+"""Prints the SSIM that scikit-image gives a pair of images; tests/cli/volume_scores.rs compares it with ours."""
 import numpy as np
 from skimage.metrics import structural_similarity
 

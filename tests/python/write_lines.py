@@ -1,6 +1,6 @@
 """Lines with radii as VTK writes them, in every encoding it has, for `phantom --tree`.
 
-    python3 write_lines.py DIRECTORY   # called by tests/tree_files.rs
+    python3 write_lines.py DIRECTORY   # called by tests/cli/tree_files.rs
 """
 import json
 import sys

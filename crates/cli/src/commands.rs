@@ -1,0 +1,108 @@
+//! Commands of the program, and the function that executes each.
+
+use super::bench::{self, BenchArgs};
+use super::calibrate::{self, CalibrateArgs};
+use super::check::{self, CheckArgs};
+use super::data::{self, ImportArgs};
+use super::devices::{self, CompletionsArgs, DevicesArgs};
+use super::eval::{self, EvalArgs};
+use super::export::{self, ConvertArgs, ExportArgs};
+use super::info::{self, InfoArgs};
+use super::kernels::{self, KernelsArgs};
+use super::options::GlobalOptions;
+use super::render::{self, RenderArgs};
+use super::selftest::{self, SelftestArgs};
+use super::study::{self, StudyArgs};
+use super::synthetic_args::{PhantomArgs, ProjectArgs};
+use super::train::{self, TrainArgs};
+use super::tree::{self, TreeArgs};
+use super::view::{self, ViewArgs};
+use super::watch::{self, WatchArgs};
+use clap::{CommandFactory, Parser, Subcommand};
+use nertca_vk::error::Result;
+
+/// 4D reconstruction of the beating coronary arteries from 3 or 4 X-ray angiography views.
+#[derive(Debug, Parser)]
+#[command(name = "nertca-vk", version, arg_required_else_help = true)]
+pub struct Cli {
+    /// Options that every command accepts.
+    #[command(flatten)]
+    pub global: GlobalOptions,
+    /// Command to run.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// Commands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// List the Vulkan devices, their limits, and the code paths that are used on them.
+    Devices(DevicesArgs),
+    /// Make a synthetic dataset with exact masks.
+    Phantom(PhantomArgs),
+    /// Make a dataset from projections of voxel volumes, one volume per phase.
+    Project(ProjectArgs),
+    /// Import clinical data as a dataset.
+    Import(ImportArgs),
+    /// Reconstruct a dataset into a run directory.
+    Train(TrainArgs),
+    /// Score a run on views that it was not trained on.
+    Eval(EvalArgs),
+    /// Render a run from any angle at any phase.
+    Render(RenderArgs),
+    /// View a run in a browser: turn the C-arm with the mouse while the beat plays.
+    View(ViewArgs),
+    /// Reconstruct DICOM runs while they appear in a folder, and view the growing reconstruction in a browser.
+    Watch(WatchArgs),
+    /// Export volumes or vessel surfaces of a run for other tools.
+    Export(ExportArgs),
+    /// Extract the vessels of a run as trees: centrelines with radii in mm, tracked over the beat.
+    Tree(TreeArgs),
+    /// Correct views whose geometry is inconsistent, from the angiograms alone.
+    Calibrate(CalibrateArgs),
+    /// Convert a dataset between the native and the authors' layout.
+    Convert(ConvertArgs),
+    /// Measure iterations, passes and renderings against device limits and the 37 minutes of the paper.
+    Bench(BenchArgs),
+    /// Compare every compute stage on this device with its f64 reference; run this first on an unknown device.
+    Selftest(SelftestArgs),
+    /// List every pipeline that a preset uses, as the device's driver compiles it: registers, spills, size.
+    Kernels(KernelsArgs),
+    /// Run a study of data sets x methods x seeds, and write tables of its results next to published ones.
+    Study(StudyArgs),
+    /// Check whether a dataset is consistent, and name the usual mistakes that it has.
+    Check(CheckArgs),
+    /// Describe a dataset or a run.
+    Info(InfoArgs),
+    /// Print shell completions.
+    Completions(CompletionsArgs),
+}
+
+impl Cli {
+    /// Executes the command.
+    pub fn run(&self) -> Result<()> {
+        let global = &self.global;
+        match &self.command {
+            Command::Devices(args) => devices::run(args),
+            Command::Phantom(args) => data::phantom(global, args),
+            Command::Project(args) => data::project(global, args),
+            Command::Import(args) => data::import(args),
+            Command::Train(args) => train::run(global, args),
+            Command::Eval(args) => eval::eval(global, args),
+            Command::Render(args) => render::render(global, args),
+            Command::View(args) => view::view(global, args),
+            Command::Watch(args) => watch::run(global, args),
+            Command::Export(args) => export::export(global, args),
+            Command::Tree(args) => tree::run(global, args),
+            Command::Calibrate(args) => calibrate::run(args),
+            Command::Convert(args) => export::convert(args),
+            Command::Bench(args) => bench::run(global, args),
+            Command::Kernels(args) => kernels::run(global, args),
+            Command::Selftest(args) => selftest::run(global, args),
+            Command::Study(args) => study::run(global, args),
+            Command::Check(args) => check::run(args),
+            Command::Info(args) => info::info(args),
+            Command::Completions(args) => devices::completions(args, &mut Cli::command()),
+        }
+    }
+}

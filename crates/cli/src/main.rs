@@ -1,0 +1,78 @@
+//! The command line: arguments, progress, exit codes. It contains no algorithms.
+
+/// Prints a line to stdout. A closed stdout (as with `| head`) is not an error.
+macro_rules! out {
+    ($($text:tt)*) => {{
+        use std::io::Write as _;
+        let _ = writeln!(std::io::stdout(), $($text)*);
+    }};
+}
+
+mod bench;
+mod bench_report;
+mod calibrate;
+mod calibration_table;
+mod check;
+mod commands;
+mod data;
+mod device;
+mod devices;
+mod dicom_args;
+mod eval;
+mod exit;
+mod export;
+mod frame_rates;
+mod geometry_picture;
+mod info;
+mod kernels;
+mod lettering;
+mod options;
+mod page;
+mod plot;
+mod progress;
+mod render;
+mod report;
+mod score_table;
+mod selftest;
+mod study;
+mod study_page;
+mod synthetic_args;
+mod train;
+mod tree;
+mod tree_section;
+mod tree_table;
+mod view;
+mod view_server;
+mod view_tree;
+mod viewpoint;
+mod volume_table;
+mod watch;
+mod watch_leave;
+mod watch_live;
+
+use clap::Parser;
+use commands::Cli;
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    tracing_subscriber::fmt()
+        .with_writer(std::io::stderr)
+        .with_env_filter(tracing_subscriber::EnvFilter::new(if cli.global.verbose {
+            "info,nertca_vk=debug,nertca_vk_gpu=debug"
+        } else {
+            "error"
+        }))
+        .without_time()
+        .init();
+    match cli.run() {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("nertca-vk: {error}");
+            if let Some(hint) = exit::hint(&error) {
+                eprintln!("nertca-vk: hint: {hint}");
+            }
+            ExitCode::from(exit::code(&error))
+        }
+    }
+}

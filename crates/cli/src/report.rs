@@ -1,0 +1,160 @@
+//! Report of a finished run: scores on every unseen image, pictures of them, and a page.
+
+use super::page::Page;
+use super::tree_section::TreeSection;
+use nertca_vk::calibrate::correction::Calibration;
+use nertca_vk::choice::Choice;
+use nertca_vk::error::Result;
+use nertca_vk::gaussians::field::DynamicGaussians;
+use nertca_vk::gpu::device::Gpu;
+use nertca_vk::kernels::tuning::Tuning;
+use nertca_vk::model::Model;
+use nertca_vk::run::history::History;
+use nertca_vk::run::{hull_pictures, silhouette_pictures};
+use nertca_vk::scan::canvas::in_words;
+use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::score::eval::Evaluation;
+use nertca_vk::trees::tree::BeatTree;
+use std::path::{Path, PathBuf};
+
+/// Inputs of `report.html`.
+pub struct Report<'a> {
+    /// Device the model was scored on.
+    pub gpu: &'a Gpu,
+    /// Computation paths of the kernels.
+    pub tuning: &'a Tuning,
+    /// Trained fields.
+    pub model: &'a Model,
+    /// Dataset that they were scored with.
+    pub dataset: &'a Dataset,
+    /// Scores, where there are any.
+    pub evaluation: Option<&'a Evaluation>,
+    /// Warnings that reduce the value of the fields or of the scores.
+    pub warnings: &'a [String],
+    /// Run directory, whose log and calibration describe how the model was made, if they exist.
+    pub run: &'a Path,
+    /// Vessels as a tree, if it was requested.
+    pub tree: Option<&'a BeatTree>,
+    /// Directory of the comparison pictures.
+    pub pictures: &'a Path,
+}
+
+impl Report<'_> {
+    /// Writes the page.
+    ///
+    /// # Errors
+    /// [`nertca_vk::error::Error::Io`]; [`nertca_vk::error::Error::Data`] for a run's calibration that cannot be read.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let Report { gpu, tuning, model, dataset, evaluation, run, pictures, .. } = *self;
+        let log = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
+        let metrics: Vec<serde_json::Value> = log.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+        let latest = |event: &str| metrics.iter().rev().find(|line| line["event"] == event);
+        let mut facts = vec![
+            ("dataset".to_owned(), dataset.path.display().to_string()),
+            ("images".to_owned(), images_of(dataset)),
+            ("iterations".to_owned(), format!("{} of {}", model.step, model.config.train.iterations)),
+            ("parameters".to_owned(), model.param_map.len.to_string()),
+            ("preset".to_owned(), model.config.preset.name().to_owned()),
+            ("scored on".to_owned(), gpu.info().name.clone()),
+            ("commit".to_owned(), nertca_vk_study::COMMIT.to_owned()),
+        ];
+        if let Some(hull) = &model.hull {
+            facts.push(("hull".into(), format!("{:.3} % of the box", 100.0 * hull.share())));
+        }
+        if let Some(field) = &model.gaussians {
+            facts.push(("Gaussians".into(), gaussians_of(field)));
+        }
+        facts.extend(model.field.as_ref().map(|field| field.fact()));
+        if let Some(started) = latest("started") {
+            facts.push(("trained on".into(), started["device"].as_str().unwrap_or_default().to_owned()));
+            let notes = started["notes"].as_array().into_iter().flatten().filter_map(|n| n.as_str());
+            facts.extend(notes.map(|note| ("note".to_owned(), note.to_owned())));
+        } else {
+            facts.extend(tuning.reasons.iter().map(|reason| ("note".to_owned(), reason.clone())));
+        }
+        if let Some(s) = latest("finished").and_then(|line| line["train_s"].as_f64()) {
+            facts.push(("training".into(), format!("{s:.1} s; the paper: 2220 s on an RTX A5000")));
+        }
+        let frames = dataset.validation().iter();
+        let tree = model.gaussians.as_ref().and_then(DynamicGaussians::deformable);
+        let of_views = |file: fn(&Path, usize) -> PathBuf| {
+            let files = dataset.training_views().into_iter().map(|view| (view, file(&run.join("report"), view)));
+            files.filter(|(_, file)| file.is_file()).collect()
+        };
+        let page = Page {
+            title: run.file_name().map_or("run".into(), |name| name.to_string_lossy().into_owned()),
+            facts,
+            warnings: self.all_warnings(),
+            metrics,
+            history: History::read(run),
+            evaluation,
+            motion: tree.map_or(Vec::new(), |t| (0..t.rest.n_phases).map(|p| t.displacement(p as f64)).collect()),
+            pictures: frames
+                .map(|f| (f.view, f.phase, pictures.join(format!("{}.png", f.name))))
+                .filter(|(_, _, file)| file.is_file())
+                .collect(),
+            hull: of_views(hull_pictures::file),
+            calibration: Calibration::read(run)?,
+            silhouettes: of_views(silhouette_pictures::file),
+            tree: self.tree.map(|tree| TreeSection::new(tree, dataset)).transpose()?,
+            config: model.config.to_toml()?,
+        };
+        page.write(path)
+    }
+
+    fn all_warnings(&self) -> Vec<String> {
+        let (model, dataset) = (self.model, self.dataset);
+
+        let mut warnings = Vec::new();
+        if model.step < model.config.train.iterations {
+            warnings.push(format!(
+                "The run is not finished: {} of {} iterations.",
+                model.step, model.config.train.iterations
+            ));
+        }
+        if model.config.hull.enabled && model.hull.is_none() && model.gaussians.is_none() {
+            warnings.push(
+                "No motion hull was used: the views may disagree, or there is motion in too much of the images."
+                    .to_owned(),
+            );
+        }
+        if let Some(hull) = model.hull.as_ref().filter(|h| h.share() < 5e-5) {
+            warnings.push(format!(
+                "The motion hull keeps only {:.4} % of the box, so the views hardly agree. Check geometry and phases, \
+                 or raise hull.dilate_pixels.",
+                100.0 * hull.share()
+            ));
+        }
+        if self.evaluation.is_none() {
+            warnings.push(match dataset.validation().is_empty() {
+                true => "The dataset has no validation frames, so nothing was scored.".to_owned(),
+                false => "The run is not scored yet: use `nertca-vk eval`.".to_owned(),
+            });
+        }
+        if !dataset.validation().is_empty() && dataset.validation().iter().all(|f| f.mask.is_none()) {
+            warnings.push("The validation frames have no vessel masks, so there is no Dice.".to_owned());
+        }
+        warnings.extend(self.warnings.iter().cloned());
+        warnings
+    }
+}
+
+fn gaussians_of(field: &DynamicGaussians) -> String {
+    let form = match field {
+        DynamicGaussians::PerPhase(_) => "one set per phase",
+        DynamicGaussians::Deformable(_) => "one deformable set",
+    };
+    let kib = field.bytes() as f64 / 1024.0;
+    format!("{}, {form} (gaussians.form = \"{}\"), {kib:.0} KiB", field.rows().rows.len(), field.form().name())
+}
+
+fn images_of(dataset: &Dataset) -> String {
+    format!(
+        "{}; {} for training from {} views, {} for validation, {} phases",
+        in_words(&dataset.sizes()),
+        dataset.training().len(),
+        dataset.training_views().len(),
+        dataset.validation().len(),
+        dataset.n_phases
+    )
+}

@@ -1,0 +1,84 @@
+//! `selftest`: compares every compute stage with its f64 twin.
+
+use super::options::GlobalOptions;
+use clap::Args;
+use nertca_vk::error::{Error, Result};
+use nertca_vk::gpu::capabilities::DeviceInfo;
+use nertca_vk::selftest::{self, Report};
+use serde::Serialize;
+use std::time::Instant;
+
+/// Arguments of `selftest`.
+#[derive(Debug, Args)]
+pub struct SelftestArgs {
+    /// Print JSON instead of text.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Output of `--json`; together with that of `devices --json`, it has all that a bug report needs.
+#[derive(Serialize)]
+struct Answer<'a> {
+    version: &'static str,
+    commit: &'static str,
+    device: &'a DeviceInfo,
+    ok: bool,
+    seconds: f64,
+    #[serde(flatten)]
+    report: &'a Report,
+}
+
+/// Runs the comparisons, prints a table, and fails when a stage differs from its twin.
+pub fn run(global: &GlobalOptions, args: &SelftestArgs) -> Result<()> {
+    let gpu = global.open_device()?;
+    let begin = Instant::now();
+    let report = selftest::run(&gpu, &mut |part, done, of| eprintln!("{} of {of}: {part}", done + 1))?;
+    let seconds = begin.elapsed().as_secs_f64();
+    if args.json {
+        let (version, commit) = (env!("CARGO_PKG_VERSION"), nertca_vk_study::COMMIT);
+        let (device, ok) = (gpu.info(), report.is_ok());
+        let answer = Answer { version, commit, device, ok, seconds, report: &report };
+        out!("{}", nertca_vk::files::pretty_json(&answer)?);
+    } else {
+        print(gpu.info(), &report, seconds);
+    }
+    global.close_device(&gpu)?;
+    if report.is_ok() { Ok(()) } else { Err(Error::NoDevice(fault(gpu.info(), &report))) }
+}
+
+fn print(device: &DeviceInfo, report: &Report, seconds: f64) {
+    out!("{} ({})", device.name, device.driver);
+    report.paths.iter().for_each(|path| out!("- {path}"));
+    out!("{:9} {:>5} {:>9} {:>9}         stages", "path", "cases", "deviation", "tolerance");
+    for row in &report.rows {
+        let verdict = if row.is_ok() { "ok" } else { "FAILED" };
+        let (path, name) = (&row.path, row.name());
+        out!("{path:9} {:5} {:9.1e} {:9.1e} {verdict:7} {name}", row.cases, row.deviation, row.tolerance);
+        if !row.is_ok() {
+            out!("          in {}", row.seen_in);
+        }
+    }
+    report.errors.iter().for_each(|failure| out!("FAILED  {}: {}", failure.part, failure.error));
+    if !report.untested.is_empty() {
+        out!("not tested: {}", report.untested.join(", "));
+    }
+    if report.is_ok() {
+        out!("All {} comparisons are within their tolerances, in {seconds:.0} s.", report.rows.len());
+    }
+}
+
+/// Describes the failure. The first failed stage is the relevant one, because the stages after it use its results.
+fn fault(device: &DeviceInfo, report: &Report) -> String {
+    let (failed, all) = (report.failed().count(), report.rows.len());
+    let first = match (report.failed().next(), report.errors.first()) {
+        (Some(row), _) => format!("the first is {} on the path {}", row.name(), row.path),
+        (None, Some(failure)) => format!("{} ended with: {}", failure.part, failure.error),
+        (None, None) => "nothing was compared".to_owned(),
+    };
+    format!(
+        "{failed} of {all} comparisons failed on {} ({}), {first}. Do not rely on results of this device: try another \
+         driver or --device. Please report this with the output of `nertca-vk selftest --json` and of `nertca-vk \
+         devices --json`",
+        device.name, device.driver
+    )
+}

@@ -1,0 +1,169 @@
+//! The page of a study: its table, Dice over the time of training, and pictures side by side. It is self-contained.
+
+use super::page::{DISTANCE_TITLE, STYLE, embedded};
+use super::plot::{Line, plot};
+use maud::{DOCTYPE, Markup, PreEscaped, html};
+use nertca_vk::error::Result;
+use nertca_vk::files;
+use nertca_vk_study::data::DataSet;
+use nertca_vk_study::outcome::{CurvePoint, Outcome, run_directory};
+use nertca_vk_study::plan::{Run, Study};
+use nertca_vk_study::scores::Score;
+use nertca_vk_study::table::{Cell, Table};
+use nertca_vk_study::work::picture_file;
+use plotters::style::RGBColor;
+use std::path::Path;
+
+/// Colours of methods, distinguishable with colour vision deficiencies (Okabe and Ito 2008).
+const COLOURS: [RGBColor; 7] = [
+    RGBColor(0, 114, 178),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(230, 159, 0),
+    RGBColor(86, 180, 233),
+    RGBColor(0, 0, 0),
+];
+
+/// A run and its outcome.
+struct Finished {
+    run: Run,
+    outcome: Outcome,
+}
+
+/// Writes the page.
+///
+/// # Errors
+/// Errors of results and pictures that cannot be read, and of writing.
+pub fn write(study: &Study, directory: &Path, page: &Path) -> Result<()> {
+    let table = Table::gather(study, directory)?;
+    let finished = finished(study, directory)?;
+    let sections = (0..study.data.len())
+        .map(|data| {
+            let of_data: Vec<&Finished> = finished.iter().filter(|f| f.run.data == data).collect();
+            Ok(html! {
+                @if !of_data.is_empty() {
+                    h2 { (study.data[data].label) @if let Some(views) = study.data[data].views { ", " (views) " views" } }
+                    (curves(study, &of_data)?)
+                    (pictures(study, directory, &of_data)?)
+                }
+            })
+        })
+        .collect::<Result<Vec<Markup>>>()?;
+    let text = html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                meta name="viewport" content="width=device-width";
+                title { (study.title) " - nertca-vk" }
+                style { (PreEscaped(STYLE)) }
+            }
+            body {
+                h1 { (study.title) }
+                p.lead { "A study with nertca-vk " (env!("CARGO_PKG_VERSION")) }
+                (rows(&table))
+                @for note in &table.notes { p.lead { (note) } }
+                @for section in &sections { (section) }
+            }
+        }
+    };
+    Ok(files::write_atomic(page, text.into_string().as_bytes())?)
+}
+
+/// Returns the runs that have a result for the study's current inputs.
+fn finished(study: &Study, directory: &Path) -> Result<Vec<Finished>> {
+    let mut finished = Vec::new();
+    for run in study.runs() {
+        let outcome = Outcome::read(&run_directory(directory, &run))?;
+        let wanted = study.fingerprint(&run)?;
+        if let Some(outcome) = outcome.filter(|outcome| outcome.fingerprint.asks_the_same(&wanted)) {
+            finished.push(Finished { run, outcome });
+        }
+    }
+    Ok(finished)
+}
+
+fn rows(table: &Table) -> Markup {
+    let grid = table.grid();
+    let text = |score, cell: &Cell| html! { @if cell.best { b { (cell.plain(score)) } } @else { (cell.plain(score)) } };
+    html! {
+        div style="overflow-x:auto" { table style="white-space:nowrap" {
+            tr {
+                @for heading in &grid.headings { th { (heading) } }
+                @for (group, score) in &grid.columns { th { @if !group.is_empty() { (group) br; } (score.heading()) } }
+            }
+            @for (names, cells) in &grid.rows {
+                tr {
+                    @for name in names { td { (name) } }
+                    @for ((_, score), cell) in grid.columns.iter().zip(cells) {
+                        td { @if let Some(cell) = cell { (text(*score, cell)) } }
+                    }
+                }
+            }
+        } }
+    }
+}
+
+/// Plots Dice, and distances to true vessels, over the time of training.
+fn curves(study: &Study, finished: &[&Finished]) -> Result<Markup> {
+    let mut dice = lines(study, finished, |point| point.dice);
+    if let Some(Finished { run, .. }) = finished.first().filter(|_| !dice.is_empty()) {
+        dice.extend(published_ends(study, &study.data[run.data]));
+    }
+    let distances = lines(study, finished, |point| point.chamfer_mm);
+    let plots = [
+        plot("Dice of the dynamic field on some unseen images", &dice, false)?,
+        plot(DISTANCE_TITLE, &distances, false)?,
+    ];
+    Ok(html! { @for svg in plots { @if !svg.is_empty() { div.plot { (PreEscaped(svg)) } } } })
+}
+
+/// Makes one line per run, with one colour per method.
+fn lines(study: &Study, finished: &[&Finished], pick: fn(&CurvePoint) -> Option<f64>) -> Vec<Line> {
+    let mut lines: Vec<Line> = Vec::new();
+    for Finished { run, outcome } in finished {
+        let points: Vec<(f64, f64)> = outcome.curve.iter().filter_map(|p| Some((p.train_s, pick(p)?))).collect();
+        if points.is_empty() {
+            continue;
+        }
+        let label = &study.methods[run.method].label;
+        let name = if lines.iter().any(|line| line.name == *label) { String::new() } else { label.clone() };
+        lines.push(Line { name, colour: COLOURS[run.method % COLOURS.len()], points });
+    }
+    lines
+}
+
+/// Returns the final points of published runs on a data set, as far as they are known.
+fn published_ends(study: &Study, set: &DataSet) -> Vec<Line> {
+    let Some(published) = &study.published else { return Vec::new() };
+    let end = |(index, method): (usize, &str)| {
+        let value = |score| published.value(method, &set.name, set.views, score);
+        let points = vec![(60.0 * value(Score::Minutes)?, value(Score::Dice)?)];
+        let colour = COLOURS[(study.methods.len() + index) % COLOURS.len()];
+        Some(Line { name: format!("{method}, as published"), colour, points })
+    };
+    published.methods().into_iter().enumerate().filter_map(end).collect()
+}
+
+/// Shows the first unseen image of each method's first run.
+fn pictures(study: &Study, directory: &Path, finished: &[&Finished]) -> Result<Markup> {
+    let mut figures = Vec::new();
+    for (method, m) in study.methods.iter().enumerate() {
+        let runs = finished.iter().filter(|f| f.run.method == method);
+        let mut files = runs.map(|f| (f.run.seed, picture_file(&run_directory(directory, &f.run))));
+        if let Some((seed, file)) = files.find(|(_, file)| file.is_file()) {
+            figures.push((&m.label, seed, embedded(&file)?));
+        }
+    }
+    Ok(html! {
+        @if !figures.is_empty() {
+            p.lead { "First unseen image: truth, prediction, static field, dynamic field, vessel overlap (green found, red missed, blue added)." }
+            div.by-view {
+                @for (label, seed, data) in &figures {
+                    figure { img alt=(format!("{label}, seed {seed}")) src=(data); figcaption { (label) ", seed " (seed) } }
+                }
+            }
+        }
+    })
+}

@@ -1,0 +1,187 @@
+//! `train`: performs a run and writes its report.
+
+use super::eval::print_table;
+use super::options::{ConfigArgs, GlobalOptions};
+use super::progress::{print_json, show_progress, stop_flag};
+use super::report::Report;
+use super::tree::{of_page as tree_of_page, remove_old as remove_old_tree, score as score_tree_of_page};
+use clap::Args;
+use nertca_vk::checkpoint::{self, newest_model};
+use nertca_vk::config::Config;
+use nertca_vk::error::{Error, Result};
+use nertca_vk::files;
+use nertca_vk::formats::nrrd;
+use nertca_vk::plan::Plan;
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::run::events::Event;
+use nertca_vk::run::info::RunInfo;
+use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
+use nertca_vk::run::score::{ScoreOptions, as_trained, evaluate_model};
+use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::score::eval::{Evaluation, moving_field_warning};
+use std::path::{Path, PathBuf};
+
+/// Arguments of `train`.
+#[derive(Debug, Args)]
+pub struct TrainArgs {
+    /// Dataset directory (native or authors' layout).
+    #[arg(required_unless_present = "print_config")]
+    pub data: Option<PathBuf>,
+    /// Run directory.
+    #[arg(short, long, value_name = "RUN", required_unless_present = "print_config")]
+    pub out: Option<PathBuf>,
+    /// Hyper-parameters.
+    #[command(flatten)]
+    pub config: ConfigArgs,
+    /// Length of the run (same as --set train.iterations=N).
+    #[arg(long, value_name = "N")]
+    pub iterations: Option<u32>,
+    /// Seed (same as --set seed=S).
+    #[arg(long, value_name = "S")]
+    pub seed: Option<u32>,
+    /// Continue from the newest checkpoint in RUN, with its configuration.
+    #[arg(long, conflicts_with_all = ["preset", "config", "set", "iterations", "seed"])]
+    pub resume: bool,
+    /// Save and stop after N iterations; schedules are computed for the full length.
+    #[arg(long, value_name = "N")]
+    pub stop_at: Option<u32>,
+    /// Print one JSON object per line on stdout instead of a progress bar.
+    #[arg(long)]
+    pub json: bool,
+    /// Do not write scores and pictures of the unseen images; `eval` can do it later.
+    #[arg(long)]
+    pub no_eval: bool,
+    /// Also find the vessels as a tree (takes seconds): shown over the angiograms in the report, with lengths and
+    /// diameters, and written as `tree.json` beside it.
+    #[arg(long)]
+    pub tree: bool,
+    /// Start over in a directory that already holds a run.
+    #[arg(short, long)]
+    pub force: bool,
+    /// Print the configuration as TOML and exit.
+    #[arg(long)]
+    pub print_config: bool,
+    /// Export the motion hull as NRRD and exit without training.
+    #[arg(long, value_name = "FILE.nrrd")]
+    pub export_hull: Option<PathBuf>,
+}
+
+fn config(args: &TrainArgs) -> Result<Config> {
+    let iterations = args.iterations.map(|n| format!("train.iterations={n}"));
+    args.config.load(iterations.into_iter().chain(args.seed.map(|s| format!("seed={s}"))))
+}
+
+/// Trains and writes the report.
+pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
+    let config = config(args)?;
+    if args.print_config {
+        out!("{}", config.acting_toml()?.trim_end());
+        return Ok(());
+    }
+    let (Some(data), Some(run)) = (&args.data, &args.out) else {
+        return Err(Error::Internal("clap requires DATA and --out".into()));
+    };
+    let dataset = Dataset::open(data)?;
+    if let Some(file) = &args.export_hull {
+        return export_hull(&config, &dataset, file);
+    }
+    prepare_directory(run, args)?;
+    let cancel = stop_flag()?;
+    let gpu = global.open_device()?;
+    RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) }.write(run)?;
+    // A resumed run keeps its own configuration, for which the paths are chosen.
+    let config = if args.resume { newest_model(run)?.config } else { config };
+    let tuning = global.training_tuning(&gpu, &config, &dataset)?;
+    let options = RunOptions { tuning: &tuning, run, resume: args.resume, stop_at: args.stop_at, cancel: &cancel };
+    let mut observer: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
+    reconstruct(&gpu, &config, &dataset, &options, &mut observer)?;
+    let dataset = as_trained(dataset, run)?;
+    let report = run.join("report");
+    let (model, page) = (newest_model(run)?, run.join("report.html"));
+    let mut warnings = Vec::new();
+    let mut evaluation = None;
+    if !args.no_eval && dataset.validation().is_empty() {
+        warnings.extend(moving_field_warning(&Renderer::new(&gpu, &model, tuning.clone())?, &dataset)?);
+    } else if !args.no_eval {
+        let scoring = ScoreOptions { threshold_per_mm: None, pictures: Some(&report), cancel: &cancel };
+        let outcome = evaluate_model(&gpu, &tuning, &model, &dataset, &scoring, &mut observer);
+        if let Err(Error::Interrupted) = outcome {
+            let (run, report) = (run.display(), report.display());
+            eprintln!("the run is complete, but not scored; use: nertca-vk eval \"{run}\" --images \"{report}\"");
+        }
+        let scores = outcome?;
+        // The scores are written now, and again with those of the tree, because finding the tree may fail or be
+        // stopped.
+        write_scores(&report, &scores)?;
+        evaluation = Some(scores);
+    }
+    drop(observer);
+    let tree = if args.tree {
+        tree_of_page(global, &gpu, &model, &cancel, run, &mut warnings)?
+    } else {
+        remove_old_tree(run, &mut warnings);
+        None
+    };
+    if let Some(scores) = &mut evaluation {
+        scores.warnings.append(&mut warnings);
+        score_tree_of_page(tree.as_ref(), &dataset, scores)?;
+        write_scores(&report, scores)?;
+        warnings.clone_from(&scores.warnings);
+    }
+    Report {
+        gpu: &gpu,
+        tuning: &tuning,
+        model: &model,
+        dataset: &dataset,
+        evaluation: evaluation.as_ref(),
+        warnings: &warnings,
+        tree: tree.as_ref(),
+        run,
+        pictures: &report,
+    }
+    .write(&page)?;
+    if let Some(evaluation) = evaluation.as_ref().filter(|_| !args.json) {
+        print_table(evaluation);
+        out!("report: {}, pictures: {}", page.display(), report.display());
+    }
+    warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
+    global.close_device(&gpu)
+}
+
+fn write_scores(report: &Path, scores: &Evaluation) -> Result<()> {
+    Ok(files::write_atomic(&report.join("evaluation.json"), files::pretty_json(scores)?.as_bytes())?)
+}
+
+fn prepare_directory(run: &Path, args: &TrainArgs) -> Result<()> {
+    if args.resume || !run.exists() {
+        return Ok(());
+    }
+    let old = checkpoint::list(run)?;
+    if old.is_empty() {
+        return Ok(());
+    }
+    if !args.force {
+        return Err(Error::config(
+            "--out",
+            run.display(),
+            "already contains a run: continue it with --resume, or start over with --force",
+        ));
+    }
+    for (_, path) in old {
+        std::fs::remove_file(&path).map_err(Error::io("remove", &path))?;
+    }
+    Ok(())
+}
+
+fn export_hull(config: &Config, dataset: &Dataset, file: &Path) -> Result<()> {
+    let plan = Plan::new(config, dataset)?;
+    plan.notes.iter().for_each(|note| eprintln!("{note}"));
+    let hull = plan.hull.ok_or_else(|| {
+        Error::config(
+            "hull",
+            "",
+            "this configuration does not use a motion hull, or none can be computed for this dataset",
+        )
+    })?;
+    Ok(nrrd::write(file, &hull.to_volume(), "phases at which a cell may contain moving vessels")?)
+}

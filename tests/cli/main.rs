@@ -1,0 +1,43 @@
+//! The program `nertca-vk` as users run it.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
+
+#[path = "../common/c_scene.rs"]
+mod c_scene;
+#[path = "../common/mod.rs"]
+mod common;
+#[path = "../common/dicom.rs"]
+mod dicom;
+#[path = "../common/known_tree.rs"]
+mod known_tree;
+#[path = "../common/program.rs"]
+mod program;
+#[path = "../common/python.rs"]
+mod python;
+#[path = "../common/root.rs"]
+mod root;
+#[path = "../common/said.rs"]
+mod said;
+#[path = "../common/shared.rs"]
+mod shared;
+
+mod calibrated_scores;
+#[cfg(unix)]
+mod campaign;
+mod capi_truth;
+mod dicom_export;
+mod gaussian_runs;
+mod imperfect_angiograms;
+mod inflow;
+mod interfaces;
+mod interop;
+mod method_runs;
+mod motion;
+mod moving_runs;
+mod network_runs;
+mod selftest;
+mod study;
+mod tree_files;
+mod tree_pages;
+mod trees;
+mod volume_scores;
+mod watch;

@@ -1,0 +1,171 @@
+//! Vessels as trees, through the program: angiograms of a known tree are made, and the tree is reconstructed and extracted.
+//! VTK opens the files, SciPy compares.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "tests")]
+
+use crate::known_tree::{PHASES, POINTS, Trained, nertca, ok, text, train, trained};
+use crate::program::whole_config;
+use crate::python::python;
+use nertca_vk::capi::context::*;
+use nertca_vk::capi::reconstruction::*;
+use nertca_vk::capi::status::{NERTCA_ERROR_BUFFER, NERTCA_OK};
+use nertca_vk::capi::tree::nertca_reconstruction_tree;
+use nertca_vk::capi::types::{nertca_log, nertca_tree};
+use nertca_vk::checkpoint;
+use nertca_vk::config::Preset;
+use serde_json::{Value, json};
+use std::ffi::CString;
+use std::path::Path;
+use std::ptr::{null, null_mut};
+
+#[test]
+fn the_tree_is_the_true_one_in_every_format() {
+    let (directory, Trained { run, .. }) = (tempfile::tempdir().unwrap(), trained());
+    let to = |name: &str| directory.path().join(name);
+    for (name, files) in [("beat.json", 1), ("beat.vtp", PHASES + 1), ("beat.swc", PHASES), ("beat.glb", 1)] {
+        let (made, said) = ok(&["tree", text(run), "-o", text(&to(name))]);
+        assert_eq!(made.lines().count(), files, "{made}");
+        assert!(made.lines().all(|file| Path::new(file).is_file()));
+        assert!(said.contains("\ntracked") || said.contains("; tracked"), "{said}");
+    }
+    let (one, _) = ok(&["tree", text(run), "-o", text(&to("one.vtp")), "--phase", "2"]);
+    assert_eq!(one.trim(), text(&to("one.vtp")), "one phase is one file, under its own name");
+    check("check_trees.py", &[directory.path()]);
+    check("check_tubes.py", &[&to("beat.glb"), &to("beat.json")]);
+    for name in ["still.json", "still.glb"] {
+        ok(&["tree", text(run), "-o", text(&to(name)), "--phase", "2"]);
+    }
+    check("check_tubes.py", &[&to("still.glb"), &to("still.json")]);
+}
+
+/// Runs one of the tests' scripts.
+fn check(script: &str, files: &[&Path]) {
+    let script = crate::root::root().join("tests/python").join(script);
+    let outcome = python().arg(script).args(files).output().unwrap();
+    print!("{}", String::from_utf8_lossy(&outcome.stdout));
+    assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
+}
+
+fn tree_of(run: &Path, file: &Path, more: &[&str]) -> Value {
+    ok(&[&["tree", text(run), "-o", text(file)], more].concat());
+    serde_json::from_slice(&std::fs::read(file).unwrap()).unwrap()
+}
+
+#[test]
+fn fields_that_carry_no_points_are_not_tracked() {
+    let (directory, Trained { data, .. }) = (tempfile::tempdir().unwrap(), trained());
+    let run = directory.path().join("sets");
+    train(data, &run, &["--iterations", "60", "--set", "gaussians.iterations=60", "--set", "gaussians.form=phase"]);
+    let file = directory.path().join("sets.json");
+    let (_, said) = ok(&["tree", text(&run), "-o", text(&file)]);
+    assert!(said.contains("not tracked"), "{said}");
+    let tubes = directory.path().join("sets.glb");
+    ok(&["tree", text(&run), "-o", text(&tubes)]);
+    check("check_tubes.py", &[&tubes, &file]);
+    let tree = tree_of(&run, &file, &["--phase", "1"]);
+    assert_eq!((&tree["tracked"], &tree["reference_phase"]), (&json!(false), &Value::Null));
+    assert!(tree["note"].as_str().unwrap().starts_with("not tracked"));
+    assert_eq!(tree["phases"].as_array().unwrap().len(), 1);
+    assert!(tree["phases"][0]["length_mm"].as_f64().unwrap() > 80.0, "{}", tree["phases"][0]["length_mm"]);
+}
+
+#[test]
+fn options_change_what_is_found() {
+    let (directory, Trained { run, .. }) = (tempfile::tempdir().unwrap(), trained());
+    let file = |name: &str| directory.path().join(name);
+    let branches = |tree: &Value| tree["phases"][0]["branches"].as_array().unwrap().len();
+    let usual = tree_of(run, &file("usual.json"), &["--phase", "0"]);
+    assert_eq!(branches(&usual), POINTS.len());
+    // Both branches are shorter than that.
+    let stem = tree_of(run, &file("stem.json"), &["--phase", "0", "--min-branch", "100"]);
+    assert_eq!(branches(&stem), 1);
+    let threshold = usual["threshold_per_mm"].as_f64().unwrap();
+    let high = tree_of(run, &file("high.json"), &["--phase", "0", "--threshold", &(1.5 * threshold).to_string()]);
+    assert!((high["threshold_per_mm"].as_f64().unwrap() / threshold - 1.5).abs() < 1e-9);
+}
+
+#[test]
+fn what_has_no_tree_is_refused() {
+    let (directory, Trained { data, run, .. }) = (tempfile::tempdir().unwrap(), trained());
+    let out = directory.path().join("x.json");
+    let refuses = |run: &Path, out: &Path, more: &[&str], parts: &[&str]| {
+        let args = [&["tree", text(run), "-o", text(out)], more].concat();
+        let answer = nertca(&args);
+        let stderr = String::from_utf8_lossy(&answer.stderr);
+        assert_eq!(answer.status.code(), Some(2), "{args:?}: {stderr}");
+        parts.iter().for_each(|part| assert!(stderr.contains(part), "{args:?} does not name `{part}`: {stderr}"));
+        assert!(!out.exists());
+    };
+    refuses(run, &directory.path().join("x.vtk"), &[], &["--out", "x.vtk", ".json .vtp .swc .glb"]);
+    refuses(run, &directory.path().join("tree"), &[], &["--out", ".json .vtp .swc .glb"]);
+    refuses(run, &out, &["--threshold", "1e3"], &["threshold_per_mm", "no vessel", "lower"]);
+    refuses(run, &out, &["--threshold", "0"], &["threshold_per_mm = 0", "positive"]);
+    refuses(run, &out, &["--threshold", "nan"], &["threshold_per_mm", "positive"]);
+    refuses(run, &out, &["--min-branch=-1"], &["least_branch_mm = -1", "positive"]);
+    refuses(run, &out, &["--phase", "4"], &["--phase", "0 to 3"]);
+    // A network that starts at zero, and is not trained yet, has no vessels.
+    let young = directory.path().join("young");
+    let nothing = ["dynamic.best_start=false", "dynamic.normalised_shift=-15"];
+    let config = whole_config(directory.path(), Preset::FastMlp, &nothing);
+    train(data, &young, &["--config", text(&config), "--iterations", "1"]);
+    refuses(&young, &out, &[], &["phase 0", "no vessel", "report"]);
+}
+
+#[test]
+fn c_callers_get_the_same_tree() {
+    let (directory, Trained { run, .. }) = (tempfile::tempdir().unwrap(), trained());
+    let written = tree_of(run, &directory.path().join("all.json"), &[]);
+    let none: *const nertca_log = null();
+    let (mut context, mut reconstruction) = (null_mut(), null_mut());
+    assert_eq!(unsafe { nertca_context_create(null(), none, &mut context) }, NERTCA_OK);
+    let options = CString::new(format!("phases = {PHASES}")).unwrap();
+    let made = unsafe { nertca_reconstruction_create(context, options.as_ptr(), &mut reconstruction) };
+    assert_eq!(made, NERTCA_OK);
+    let newest = checkpoint::newest(run).unwrap();
+    let path = CString::new(text(&newest)).unwrap();
+    assert_eq!(unsafe { nertca_reconstruction_load(reconstruction, path.as_ptr()) }, NERTCA_OK);
+
+    let mut room: nertca_tree = unsafe { std::mem::zeroed() };
+    room.size = size_of::<nertca_tree>();
+    assert_eq!(unsafe { nertca_reconstruction_tree(reconstruction, &mut room) }, NERTCA_OK);
+    assert_eq!((room.followed, room.branches), (1, PHASES * POINTS.len()));
+    assert!((room.threshold_per_mm / written["threshold_per_mm"].as_f64().unwrap() - 1.0).abs() < 1e-9);
+    let (n, points) = (room.branches, room.points);
+    let (mut phase, mut parent, mut first, mut count) = (vec![9; n], vec![9; n], vec![9; n], vec![9; n]);
+    let (mut points_mm, mut radius_mm) = (vec![f64::NAN; 3 * points], vec![f64::NAN; points]);
+    room.branch_phase = phase.as_mut_ptr();
+    room.branch_parent = parent.as_mut_ptr();
+    room.branch_first = first.as_mut_ptr();
+    room.branch_points = count.as_mut_ptr();
+    room.points_mm = points_mm.as_mut_ptr();
+    room.radius_mm = radius_mm.as_mut_ptr();
+    // Insufficient room is refused, and nothing is written.
+    room.points -= 1;
+    assert_eq!(unsafe { nertca_reconstruction_tree(reconstruction, &mut room) }, NERTCA_ERROR_BUFFER);
+    assert!(room.points == points && radius_mm[0].is_nan() && phase[0] == 9);
+    assert_eq!(unsafe { nertca_reconstruction_tree(reconstruction, &mut room) }, NERTCA_OK);
+
+    let numbers = |value: &Value| value.as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect::<Vec<_>>();
+    let mut branch = 0;
+    for (tree, of_phase) in written["phases"].as_array().unwrap().iter().enumerate() {
+        let root = branch as i64;
+        for wanted in of_phase["branches"].as_array().unwrap() {
+            let found_parent = i64::from(parent[branch]);
+            assert_eq!(wanted["parent"].as_i64().map_or(-1, |p| root + p), found_parent, "branch {branch}");
+            assert_eq!(phase[branch] as usize, tree);
+            let range = first[branch] as usize..(first[branch] + count[branch]) as usize;
+            let wanted_mm: Vec<f64> = wanted["points_mm"].as_array().unwrap().iter().flat_map(numbers).collect();
+            let found_mm = &points_mm[3 * range.start..3 * range.end];
+            assert_eq!(wanted_mm.len(), found_mm.len());
+            // The file is rounded to a tenth of a micrometre.
+            assert!(wanted_mm.iter().zip(found_mm).all(|(a, b)| (a - b).abs() < 1e-4), "branch {branch}");
+            let radii = numbers(&wanted["radius_mm"]);
+            assert!(
+                radii.len() == range.len() && radii.iter().zip(&radius_mm[range]).all(|(a, b)| (a - b).abs() < 1e-4)
+            );
+            branch += 1;
+        }
+    }
+    assert_eq!(branch, n);
+    assert_eq!(unsafe { nertca_reconstruction_destroy(reconstruction) }, NERTCA_OK);
+    assert_eq!(unsafe { nertca_context_destroy(context) }, NERTCA_OK);
+}

@@ -1,0 +1,201 @@
+//! Datasets with one of the usual mistakes are distinguished from sound ones. The mistakes are made here by independent
+//! loops.
+
+use glam::DVec3;
+use nertca_vk::check::{Check, check};
+use nertca_vk::geometry::{CArm, Geometry};
+use nertca_vk::random::{STREAM_PHOTON, normal, uniform01};
+use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
+use std::f64::consts::TAU;
+
+const PHASES: u32 = 8;
+const SIZE: usize = 100;
+
+/// Imperfections that are no mistakes.
+#[derive(Debug, Clone, Copy, Default)]
+struct Flaws {
+    seed: u32,
+    /// Standard deviation of the stated angles' errors.
+    angle_deg: f64,
+    /// Standard deviation of a pixel's noise; the strongest vessel has about 0.5.
+    noise: f64,
+}
+
+/// Angiograms of a beating vessel made of Gaussian blobs, whose line integrals are known exactly, in front of a smooth body.
+fn angiograms(n_views: usize, flaws: Flaws) -> Dataset {
+    let angles = [(-30.0, 25.0), (40.0, 20.0), (-45.0, -20.0), (5.0, -30.0)];
+    let view = |v: usize, error: f64| {
+        let off = |k: u32| error * normal(flaws.seed, STREAM_PHOTON, v as u32, k);
+        let geometry = Geometry::CArm(CArm {
+            primary_deg: angles[v].0 + off(0),
+            secondary_deg: angles[v].1 + off(1),
+            sid_mm: 1100.0,
+            sod_mm: 750.0,
+            pixel_mm: [2.0; 2],
+            offset_mm: [0.0; 2],
+            table_mm: [0.0; 3],
+        });
+        View::new(geometry, [SIZE; 2]).unwrap()
+    };
+    let mut frames = Vec::new();
+    for v in 0..n_views {
+        let rays = view(v, 0.0).rays;
+        for phase in 0..PHASES {
+            let blobs = blobs(flaws.seed, f64::from(phase) / f64::from(PHASES));
+            let integral = |p: usize| {
+                let (anchor, direction) = rays.pixel((p % SIZE) as f64, (p / SIZE) as f64);
+                let d = direction.normalize();
+                let past = |x: DVec3| (x - anchor).cross(d).length_squared();
+                let vessel: f64 = blobs.iter().map(|(x, r)| 12.0 * r * (-past(*x) / (2.0 * r * r)).exp()).sum();
+                let body = 1.5 * (-past(DVec3::new(0.2, 0.45, 0.5)) / 0.72).exp() + 0.6;
+                let noise = normal(flaws.seed, STREAM_PHOTON, 100 + v as u32 * PHASES + phase, p as u32);
+                (body + vessel + flaws.noise * noise) as f32
+            };
+            frames.push(Frame {
+                name: format!("view{v}-phase{phase}"),
+                view: v,
+                phase,
+                split: Split::Train,
+                integrals: (0..SIZE * SIZE).map(integral).collect(),
+                mask: None,
+                after_phase: 0.0,
+                heart_shift_mm: [0.0; 3],
+            });
+        }
+    }
+    Dataset {
+        path: "angiograms".into(),
+        layout: Layout::Native,
+        views: (0..n_views).map(|v| view(v, flaws.angle_deg)).collect(),
+        frames,
+        width: SIZE,
+        height: SIZE,
+        n_phases: PHASES,
+        depth_range: (-1.0, 1.0),
+        hidden: Default::default(),
+        vessel_attenuation: None,
+        notes: Vec::new(),
+    }
+}
+
+/// Centres and radii of a vessel at a moment of the beat, 100 mm: fast and strong contraction, slow relaxation.
+fn blobs(seed: u32, moment: f64) -> Vec<(DVec3, f64)> {
+    let of = |k: u32| uniform01(seed, STREAM_PHOTON, 7, k);
+    let beat = if moment < 0.35 { (TAU * moment / 1.4).sin() } else { (TAU * (1.0 - moment) / 2.6).sin() };
+    let shrink = 1.0 - 0.22 * beat;
+    let at = |i: usize| {
+        let t = i as f64 / 119.0;
+        let turn = (1.4 + 0.5 * of(0)) * TAU / 2.0 * t + TAU * of(1);
+        let x = DVec3::new(
+            0.28 * shrink * turn.cos() + 0.05 * beat,
+            0.24 * shrink * turn.sin() + 0.03 * (5.0 * t).sin(),
+            0.45 * (t - 0.5) * (1.0 - 0.15 * beat) + 0.06 * (TAU * (t + of(2))).sin(),
+        );
+        (x, 0.018 - 0.010 * t)
+    };
+    (0..120).map(at).collect()
+}
+
+fn told(dataset: &Dataset) -> Check {
+    let found = check(dataset).unwrap();
+    println!("{:?} {:?}", found.agreement.as_ref().map(|a| (a.fine, a.coarse)), found.mistakes);
+    found
+}
+
+#[test]
+fn sound_data_raise_no_alarm() {
+    for n_views in [4, 3] {
+        for (seed, angle_deg, noise) in [(1, 0.0, 0.0), (2, 0.0, 0.0), (3, 0.3, 0.0), (4, 0.0, 0.03), (5, 0.3, 0.03)] {
+            let flaws = Flaws { seed, angle_deg, noise };
+            let found = told(&angiograms(n_views, flaws));
+            assert!(found.sound() && found.mistakes.is_empty(), "{n_views} views, {flaws:?}: {found:?}");
+        }
+    }
+}
+
+type Plant = fn(&mut Dataset);
+
+fn each_image(dataset: &mut Dataset, of: impl Fn(&[f32], usize, usize) -> f32) {
+    for frame in &mut dataset.frames {
+        let old = frame.integrals.clone();
+        for row in 0..SIZE {
+            for column in 0..SIZE {
+                frame.integrals[row * SIZE + column] = of(&old, row, column);
+            }
+        }
+    }
+}
+
+fn each_c_arm(dataset: &mut Dataset, change: impl Fn(&mut CArm)) {
+    for view in &mut dataset.views {
+        let Geometry::CArm(c_arm) = &mut view.geometry else { panic!("a C-arm") };
+        change(c_arm);
+        view.rays = view.geometry.rays(SIZE, SIZE).unwrap();
+    }
+}
+
+fn phases_of_view(dataset: &mut Dataset, view: usize, to: impl Fn(u32) -> u32) {
+    dataset.frames.iter_mut().filter(|f| f.view == view).for_each(|f| f.phase = to(f.phase));
+    dataset.frames.sort_by_key(|f| (f.view, f.phase));
+}
+
+#[test]
+fn each_usual_mistake_is_named() {
+    let plants: [(&str, Plant); 13] = [
+        ("transposed", |d| each_image(d, |old, row, column| old[column * SIZE + row])),
+        ("mirrored", |d| each_image(d, |old, row, column| old[row * SIZE + SIZE - 1 - column])),
+        ("upside down", |d| each_image(d, |old, row, column| old[(SIZE - 1 - row) * SIZE + column])),
+        ("rotated by 180 degrees", |d| {
+            each_image(d, |old, row, column| old[(SIZE - 1 - row) * SIZE + SIZE - 1 - column])
+        }),
+        ("primary angle has the wrong sign", |d| each_c_arm(d, |c| c.primary_deg *= -1.0)),
+        ("secondary angle has the wrong sign", |d| each_c_arm(d, |c| c.secondary_deg *= -1.0)),
+        ("primary and secondary angle are exchanged", |d| {
+            each_c_arm(d, |c| (c.primary_deg, c.secondary_deg) = (c.secondary_deg, c.primary_deg));
+        }),
+        ("pitch at the isocentre", |d| each_c_arm(d, |c| c.pixel_mm = c.pixel_mm.map(|p| p * c.sod_mm / c.sid_mm))),
+        ("logarithm was taken twice", |d| each_image(d, |old, row, column| -old[row * SIZE + column].max(1e-3).ln())),
+        ("intensities, not line integrals", |d| {
+            each_image(d, |old, row, column| 4000.0 * (-old[row * SIZE + column]).exp());
+        }),
+        ("phases of view 1 are in reverse order", |d| phases_of_view(d, 1, |phase| PHASES - 1 - phase)),
+        ("view 2 is late by 3 phases", |d| phases_of_view(d, 2, |phase| (phase + 3) % PHASES)),
+        ("views 0 and 2 are exchanged", |d| {
+            let (a, b) = (d.views[0].clone(), d.views[2].clone());
+            (d.views[0], d.views[2]) = (b, a);
+        }),
+    ];
+    let sound = angiograms(4, Flaws { seed: 6, noise: 0.005, ..Flaws::default() });
+    for (name, plant) in plants {
+        let mut wrong = sound.clone();
+        plant(&mut wrong);
+        let found = told(&wrong);
+        let first = found.mistakes.first().unwrap_or_else(|| panic!("{name}: {found:?}"));
+        assert!(first.contains(name), "{name}: {:?}", found.mistakes);
+        assert!(!found.sound());
+    }
+}
+
+#[test]
+fn views_that_have_nothing_to_do_with_each_other_are_told() {
+    let (mut mixed, other) =
+        (angiograms(3, Flaws { seed: 1, ..Flaws::default() }), angiograms(3, Flaws { seed: 9, ..Flaws::default() }));
+    for (frame, stranger) in mixed.frames.iter_mut().zip(other.frames).filter(|(f, _)| f.view > 0) {
+        // Two views are foreign, one of them rotated, so that no single mistake explains the disagreement.
+        frame.integrals = stranger.integrals;
+        if frame.view == 2 {
+            frame.integrals.reverse();
+        }
+    }
+    let found = told(&mixed);
+    assert!(!found.sound() && found.mistakes.is_empty(), "{found:?}");
+    assert!(found.warnings.iter().any(|w| w.contains("none of the usual mistakes")), "{found:?}");
+}
+
+#[test]
+fn one_view_is_not_enough() {
+    let mut single = angiograms(3, Flaws::default());
+    single.frames.retain(|f| f.view == 0);
+    let refusal = check(&single).unwrap_err().to_string();
+    assert!(refusal.contains("two such views are needed"), "{refusal}");
+}

@@ -1,0 +1,177 @@
+//! Frames that arrive while a session trains: the fit of the Gaussians is continued or restarted, and the rendering
+//! meanwhile is never worse than before.
+
+use crate::common::{expect_silence, gpu, tuning};
+use nertca_vk::checkpoint::Checkpoint;
+use nertca_vk::config::{Config, GaussianForm, Preset};
+use nertca_vk::gaussians::field::DynamicGaussians;
+use nertca_vk::geometry::MM_PER_UNIT;
+use nertca_vk::gpu::device::Gpu;
+use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
+use nertca_vk::phantom::degradations::Degradations;
+use nertca_vk::phantom::views::ViewAngles;
+use nertca_vk::plan::Plan;
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split};
+use nertca_vk::score::eval::evaluate;
+use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions};
+use nertca_vk::train::trainer::Trainer;
+
+const PHASES: u32 = 10;
+/// Iterations of Gaussians; a continued fit skips the first third.
+const GAUSSIAN_ITERATIONS: u32 = 120;
+const CARRIED: u32 = 40;
+
+fn phantom(gpu: &Gpu) -> (tempfile::TempDir, Dataset) {
+    let directory = tempfile::tempdir().unwrap();
+    let options = PhantomOptions {
+        setting: Setting::Xcat,
+        anatomy: None,
+        size: 64,
+        phases: PHASES,
+        views: ViewAngles::published(4).unwrap(),
+        seed: 1,
+        degradations: Degradations::default(),
+        layout: Layout::Native,
+        volumes_every: None,
+    };
+    make(gpu, &options, &directory.path().join("data"), |_, _, _| ()).unwrap();
+    let dataset = Dataset::open(&directory.path().join("data")).unwrap();
+    (directory, dataset)
+}
+
+fn session(gpu: &Gpu, dataset: &Dataset) -> Session {
+    session_of(gpu, dataset, GaussianForm::Deformable, GAUSSIAN_ITERATIONS + 1)
+}
+
+fn session_of(gpu: &Gpu, dataset: &Dataset, form: GaussianForm, iterations: u32) -> Session {
+    let mut config = Config::preset(Preset::Fast);
+    config.gaussians.form = form;
+    config.train.iterations = iterations;
+    let options = SessionOptions {
+        config,
+        phases: PHASES,
+        depth_half_extent_mm: dataset.depth_range.1 * MM_PER_UNIT,
+        vessel_attenuation_per_mm: dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),
+        deterministic: true,
+    };
+    Session::new(Some(gpu.clone()), Some(tuning(gpu)), options).unwrap()
+}
+
+fn add(session: &Session, dataset: &Dataset, wanted: impl Fn(&Frame) -> bool) {
+    for f in dataset.training().iter().filter(|f| f.split == Split::Train && wanted(f)) {
+        let new = NewFrame {
+            geometry: dataset.views[f.view].geometry.clone(),
+            moment: FrameTime::Phase(f.phase),
+            split: f.split,
+            width: dataset.width,
+            height: dataset.height,
+            integrals: f.integrals.clone(),
+            mask: None,
+        };
+        session.add_frame(new).unwrap();
+    }
+}
+
+/// Trains to the end of the run, and returns the number of iterations.
+fn train(session: &Session) -> u32 {
+    session.train(u32::MAX, &mut |_| true).unwrap()
+}
+
+fn field(session: &Session) -> DynamicGaussians {
+    session.checkpoint().unwrap().model.gaussians.unwrap()
+}
+
+/// Dice of the dynamic field on unseen images.
+fn dice(gpu: &Gpu, session: &Session, dataset: &Dataset) -> f64 {
+    let model = session.checkpoint().unwrap().model;
+    let renderer = Renderer::new(gpu, &model, tuning(gpu)).unwrap();
+    let unseen: Vec<&Frame> = dataset.frames.iter().filter(|f| f.split == Split::Validation).step_by(5).collect();
+    evaluate(&renderer, dataset, &unseen, model.step, None, |_| Ok(())).unwrap().dice.dynamic.unwrap()
+}
+
+#[test]
+fn gaussians_go_on_where_they_explain_what_is_new() {
+    let gpu = gpu();
+    let (directory, dataset) = phantom(&gpu);
+    let at_once = session(&gpu, &dataset);
+    add(&at_once, &dataset, |_| true);
+    assert_eq!(train(&at_once), GAUSSIAN_ITERATIONS + 1);
+    let (wanted, anew) = (dice(&gpu, &at_once, &dataset), field(&at_once));
+    drop(at_once);
+
+    // The last two phases lie between known ones.
+    let (early, late) = (|f: &Frame| f.phase < 8, |f: &Frame| f.phase >= 8);
+    let grown = session(&gpu, &dataset);
+    add(&grown, &dataset, early);
+    train(&grown);
+    let saved = directory.path().join("early.safetensors");
+    grown.checkpoint().unwrap().write(&saved).unwrap();
+    add(&grown, &dataset, late);
+    assert_eq!(train(&grown), GAUSSIAN_ITERATIONS + 1 - CARRIED);
+    let reached = dice(&gpu, &grown, &dataset);
+    println!("at once {wanted}, grown {reached}");
+    assert!(reached > wanted - 0.01, "{reached}, where all frames at once reach {wanted}");
+    let loaded = session(&gpu, &dataset);
+    loaded.load(Checkpoint::read(&saved).unwrap()).unwrap();
+    add(&loaded, &dataset, |_| true);
+    assert_eq!(train(&loaded), GAUSSIAN_ITERATIONS + 1 - CARRIED);
+    assert_eq!(field(&loaded), field(&grown), "also across save and load");
+    drop((grown, loaded));
+
+    // Half of the beat, or another view, is new information that restarts the fit.
+    for late in [&(|f: &Frame| f.phase > 4) as &dyn Fn(&Frame) -> bool, &|f: &Frame| f.view == 3] {
+        let grown = session(&gpu, &dataset);
+        add(&grown, &dataset, |f| !late(f));
+        train(&grown);
+        add(&grown, &dataset, late);
+        assert_eq!(train(&grown), GAUSSIAN_ITERATIONS + 1);
+        assert_eq!(field(&grown), anew);
+    }
+    expect_silence(gpu);
+}
+
+/// A run that ends before a fit would continue, or in the middle of one.
+#[test]
+fn short_runs_take_in_frames_as_well() {
+    const ITERATIONS: u32 = 30;
+    let gpu = gpu();
+    let (_directory, dataset) = phantom(&gpu);
+    for form in [GaussianForm::Phase, GaussianForm::Deformable] {
+        let [at_once, grown] = [(); 2].map(|()| session_of(&gpu, &dataset, form, ITERATIONS));
+        add(&at_once, &dataset, |_| true);
+        assert_eq!(train(&at_once), ITERATIONS);
+        add(&grown, &dataset, |f| f.phase < 8);
+        assert_eq!(train(&grown), ITERATIONS);
+        add(&grown, &dataset, |f| f.phase >= 8);
+        assert_eq!(train(&grown), ITERATIONS);
+        assert_eq!(field(&grown), field(&at_once), "{form:?}");
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn what_was_there_is_shown_until_there_is_better() {
+    let gpu = gpu();
+    let (_directory, dataset) = phantom(&gpu);
+    let earlier = {
+        let three_views = session(&gpu, &dataset);
+        add(&three_views, &dataset, |f| f.view < 3);
+        three_views.train(2, &mut |_| true).unwrap();
+        field(&three_views)
+    };
+    let plan = Plan::new(&Config::preset(Preset::Fast), &dataset).unwrap();
+    let mut trainer = Trainer::start_over(&gpu, plan, &dataset, tuning(&gpu), Some(&earlier)).unwrap();
+    let feed = trainer.feed().gaussians.unwrap();
+    let shown = || feed.lock().unwrap().1.clone();
+    let mut before = 0;
+    while trainer.preparation().is_some() {
+        assert_eq!(shown(), earlier);
+        trainer.advance(1).unwrap();
+        before += 1;
+    }
+    assert!(before > 3, "sets per phase and tracking come first");
+    assert!(shown() != earlier && shown().deformable().is_some());
+    drop(trainer);
+    expect_silence(gpu);
+}

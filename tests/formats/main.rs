@@ -1,0 +1,19 @@
+//! Files that are read: their right values, and clear errors for malformed ones.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
+
+#[path = "../common/mod.rs"]
+mod common;
+#[path = "../common/dicom.rs"]
+mod dicom;
+#[path = "../common/root.rs"]
+mod root;
+#[path = "../common/shared.rs"]
+mod shared;
+
+#[cfg(feature = "dicom")]
+mod image_beat;
+#[cfg(feature = "dicom")]
+mod import_frames;
+mod malformed;
+mod nerfca;
+mod real_data;

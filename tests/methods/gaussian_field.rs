@@ -1,0 +1,246 @@
+//! Gaussians as a model's dynamic field: rendering against f64, checkpoints, whole runs.
+
+use crate::common;
+use crate::common::{expect_agreement, expect_silence, gpu, phantom, run, tuning};
+use glam::DVec3;
+use nertca_vk::checkpoint::{self, Checkpoint};
+use nertca_vk::config::{Config, Preset, sections};
+use nertca_vk::error::Error;
+use nertca_vk::fields::state::FieldsState;
+use nertca_vk::gaussians::field::{DynamicGaussians, Gaussians};
+use nertca_vk::gpu::device::Gpu;
+use nertca_vk::kernels::layout::DeviceState;
+use nertca_vk::methods::dynamic_gaussians::trainer::GaussiansFit;
+use nertca_vk::model::Model;
+use nertca_vk::model::component::Component;
+use nertca_vk::plan::Plan;
+use nertca_vk::render::grid::PatientGrid;
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::run::events::Event;
+use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
+use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::selftest::blobs;
+use nertca_vk::selftest::problems::drawn_fields;
+use nertca_vk::train::trainer::Trainer;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Creates a model of a dataset with the dynamic field `field`.
+fn model(gpu: &Gpu, dataset: &Dataset, field: DynamicGaussians) -> Model {
+    blobs::model(gpu, dataset, field, &tuning(gpu)).unwrap()
+}
+
+#[test]
+fn integrals_and_maxima_match_their_twin() {
+    let gpu = gpu();
+    expect_agreement(|findings| blobs::compare_rays(&gpu, &tuning(&gpu), findings));
+    let dataset = common::small_dataset(37, 29);
+    for field in drawn_fields() {
+        let renderer = Renderer::new(&gpu, &model(&gpu, &dataset, field), tuning(&gpu)).unwrap();
+        let seen = renderer.render(&dataset.views[1].rays, 37, 29, 2).unwrap();
+        // The static field is nearly flat, so the maximum of the sum is nearly the sum of the maxima.
+        for ((total, still), moving) in seen.total_max.iter().zip(&seen.static_max).zip(&seen.dynamic_max) {
+            assert!(*total >= still.max(*moving) * 0.999 && *total <= (still + moving) * 1.001);
+        }
+        assert!(seen.dynamic_max.iter().filter(|m| **m > 0.0).count() > 60, "the case must show something");
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn cells_match_their_twin() {
+    let gpu = gpu();
+    expect_agreement(|findings| blobs::compare_cells(&gpu, &tuning(&gpu), findings));
+    expect_silence(gpu);
+}
+
+#[test]
+fn bounds_hold_all_around_their_points() {
+    let gpu = gpu();
+    let dataset = common::small_dataset(13, 11);
+    // Four fine points along each side of the cube around a coarse point.
+    let (step, n) = (0.125, 96);
+    let first = -0.5 * step * f64::from(n);
+    let (origin_mm, spacing_mm) = (DVec3::splat(first), DVec3::splat(step));
+    let fine = PatientGrid { origin_mm, spacing_mm, size: [n; 3] };
+    let coarse = PatientGrid { origin_mm: origin_mm + 1.5 * step, spacing_mm: 4.0 * spacing_mm, size: [n / 4; 3] };
+    let away_mm = 1.5 * step * 3f64.sqrt();
+    for field in drawn_fields() {
+        let renderer = Renderer::new(&gpu, &model(&gpu, &dataset, field), tuning(&gpu)).unwrap();
+        let values = renderer.sample_patient(Component::Dynamic, 1, &fine).unwrap();
+        let [min, max] = renderer.bound_patient(1, &coarse, away_mm).unwrap().unwrap();
+        let largest = values.iter().copied().fold(0.0, f32::max);
+        for (i, value) in values.iter().enumerate() {
+            let n = n as usize;
+            let [x, y, z] = [i % n, i / n % n, i / (n * n)].map(|k| k / 4);
+            let at = (z * (n / 4) + y) * (n / 4) + x;
+            let rounding = 1e-5 * largest;
+            assert!(min[at] <= value + rounding, "{i}: at least {} instead of {value}", min[at]);
+            assert!(max[at] >= value - rounding, "{i}: at most {} instead of {value}", max[at]);
+        }
+        // The bounds are informative.
+        assert!(min.iter().any(|v| *v > 0.01 * largest) && max.contains(&0.0), "nothing is told");
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn checkpoints_keep_every_bit() {
+    let gpu = gpu();
+    let dataset = common::small_dataset(13, 11);
+    for field in drawn_fields() {
+        let model = model(&gpu, &dataset, field);
+        let moments = vec![[0.25, 0.5]; model.param_map.len];
+        let state = FieldsState { moments, ..FieldsState::fresh(model.step, 0) };
+        let saved = Checkpoint { model, fit: Arc::new(state), data_fingerprint: "x".into() };
+        let bytes = saved.to_bytes().unwrap();
+        let read = Checkpoint::from_bytes(&bytes, Path::new("test")).unwrap();
+        assert_eq!(read.to_bytes().unwrap(), bytes);
+        for phase in 0..3 {
+            let at = |c: &Checkpoint| c.model.gaussians.as_ref().unwrap().at(phase);
+            assert_eq!(at(&read), at(&saved));
+        }
+        let statics = saved.model.param_map.static_len;
+        assert_eq!(read.model.params[..statics], saved.model.params[..statics]);
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn damaged_gaussians_are_refused_by_name() {
+    let gpu = gpu();
+    let model = model(&gpu, &common::small_dataset(13, 11), drawn_fields()[0].clone());
+    let state = FieldsState::fresh(model.step, model.param_map.len);
+    let refused = |change: &dyn Fn(&mut Gaussians)| {
+        let mut model = model.clone();
+        if let Some(DynamicGaussians::PerPhase(sets)) = &mut model.gaussians {
+            change(sets);
+        }
+        let saved = Checkpoint { model, fit: Arc::new(state.clone()), data_fingerprint: String::new() };
+        Checkpoint::from_bytes(&saved.to_bytes().unwrap(), Path::new("test")).err().unwrap().to_string()
+    };
+    assert!(refused(&|s| s.rows[3].log_density = f32::NAN).contains("gaussians.log_density"));
+    assert!(refused(&|s| s.rows[3].phase = 3).contains("gaussians.phase"));
+    assert!(refused(&|s| s.units.pixel = 0.0).contains("gaussians"));
+    expect_silence(gpu);
+}
+
+/// A run short enough for tests: 20 iterations of Gaussians, 12 of the static field.
+fn short_run(form: &str) -> Config {
+    let settings = [
+        "train.iterations=32",
+        "train.checkpoint_every=1000",
+        "gaussians.iterations=20",
+        "gaussians.background_every=8",
+        "gaussians.grow_at=10",
+        "gaussians.clear_at=14",
+        "gaussians.count=120",
+        "tree.warm_iterations=12",
+        "tree.track_iterations=4",
+        // With the preset's smoothness, the static field learns too little to be visible in so few iterations.
+        "static.tv=1",
+    ];
+    let mut all: Vec<String> = settings.map(String::from).to_vec();
+    all.push(format!("gaussians.form={form}"));
+    Config::preset(Preset::Fast).with_constants(&all).unwrap()
+}
+
+#[test]
+fn resume_equals_no_interruption() {
+    let gpu = gpu();
+    let directory = tempfile::tempdir().unwrap();
+    let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+    for form in ["phase", "tree"] {
+        let config = short_run(form);
+        let go = |name: &str, resume: bool, stop: Option<&dyn Fn(&Event) -> bool>| {
+            let path = directory.path().join(format!("{form}-{name}"));
+            let cancel = AtomicBool::new(false);
+            let options = RunOptions { tuning: &tuning(&gpu), run: &path, resume, stop_at: None, cancel: &cancel };
+            let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut |event| {
+                if stop.is_some_and(|stop| stop(event)) {
+                    cancel.store(true, Ordering::Relaxed);
+                }
+            });
+            match (outcome, stop) {
+                (Ok(()), None) | (Err(Error::Interrupted), Some(_)) => {}
+                (outcome, _) => panic!("{outcome:?}"),
+            }
+            std::fs::read(checkpoint::newest(&path).unwrap()).unwrap()
+        };
+        let whole = go("whole", false, None);
+        let after = |n: u32| move |e: &Event| matches!(e, Event::Progress { loss, .. } if loss.step >= n);
+        let (first, second) = (after(10), after(25));
+        let preparing = |share: f64| move |e: &Event| matches!(e, Event::Preparing { share: done } if *done >= share);
+        let (warming, tracking) = (preparing(0.2), preparing(0.6));
+        type Stop<'a> = (&'a str, &'a dyn Fn(&Event) -> bool);
+        let mut stops: Vec<Stop<'_>> =
+            vec![("while Gaussians are fitted", &first), ("while the still field is trained", &second)];
+        if form == "tree" {
+            stops.extend([("among the phases' own", &warming as &dyn Fn(&Event) -> bool), ("on the way", &tracking)]);
+        }
+        for (name, stop) in stops {
+            assert_ne!(go(name, false, Some(stop)), whole);
+            assert_eq!(go(name, true, None), whole, "{form}, stopped {name}");
+        }
+        let read = Checkpoint::from_bytes(&whole, Path::new("whole")).unwrap();
+        assert_eq!(read.model.step, 32);
+        assert_eq!(matches!(read.model.gaussians, Some(DynamicGaussians::Deformable(_))), form == "tree");
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn the_still_field_learns_what_gaussians_leave() {
+    let gpu = gpu();
+    let directory = tempfile::tempdir().unwrap();
+    let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+    let config = short_run("phase");
+    let config = Config {
+        train: sections::Train { iterations: 160, ..config.train },
+        // After so few iterations, vessels are not dense yet.
+        gaussians: sections::Gaussians { clear_at: 0, ..config.gaussians },
+        ..config
+    };
+    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    let losses = run(&mut trainer, 160);
+    assert_eq!(losses.len(), 160);
+    assert!(losses[19] < 0.7 * losses[0], "Gaussians: {} to {}", losses[0], losses[19]);
+    println!("Gaussians: {} to {}, still field: {} to {}", losses[0], losses[19], losses[20], losses[159]);
+    assert!(losses[159] < 0.5 * losses[20], "still field: {} to {}", losses[20], losses[159]);
+    let model = trainer.model().unwrap();
+    let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
+    let frame = dataset.training()[0].clone();
+    let seen = renderer.render(&dataset.views[frame.view].rays, dataset.width, dataset.height, frame.phase).unwrap();
+    let mean = |v: &[f32]| v.iter().map(|v| f64::from(*v)).sum::<f64>() / v.len() as f64;
+    let (measured, total) = (mean(&frame.integrals), mean(&seen.total_integral()));
+    assert!((total / measured - 1.0).abs() < 0.05, "{total} against {measured}");
+    assert!(mean(&seen.dynamic_integral) > 0.0);
+    drop((renderer, trainer));
+    expect_silence(gpu);
+}
+
+#[test]
+fn other_images_begin_the_fit_anew_and_keep_device_and_host_in_step() {
+    let gpu = gpu();
+    let directory = tempfile::tempdir().unwrap();
+    let mut dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+    let config = short_run("phase");
+    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    run(&mut trainer, 32);
+    let saved = trainer.checkpoint().unwrap();
+    drop(trainer);
+    dataset.frames.remove(3);
+    let plan = Plan::new(&config, &dataset).unwrap().in_scene(saved.model.scene.clone());
+    let mut trainer = Trainer::carry_on(&gpu, plan, &dataset, tuning(&gpu), &saved).unwrap();
+    assert_eq!(trainer.step(), 0);
+    let losses = run(&mut trainer, 32);
+    assert_eq!(losses.len(), 32);
+    assert!(losses.iter().all(|l| l.is_finite() && *l > 0.0), "{losses:?}");
+    // Schedules and losses are indexed by the device's count.
+    let state: Vec<DeviceState> =
+        gpu.download(&trainer.fit::<GaussiansFit>().unwrap().fields().forward().state, 0, 1).unwrap();
+    assert_eq!(state[0].step, 32);
+    drop(trainer);
+    expect_silence(gpu);
+}
