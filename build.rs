@@ -26,6 +26,9 @@ fn main() -> Result<(), Failure> {
     println!("cargo:rerun-if-changed=build");
     println!("cargo:rerun-if-changed=glsl");
     println!("cargo:rerun-if-env-changed=SHADERC_LIB_DIR");
+    if let Some(directory) = env::var_os("SHADERC_LIB_DIR") {
+        println!("cargo:rerun-if-changed={}", Path::new(&directory).join("libshaderc_combined.a").display());
+    }
     let out = PathBuf::from(env::var("OUT_DIR")?);
     write_shaders(Path::new("glsl"), &out)
 }

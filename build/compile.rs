@@ -20,14 +20,29 @@ pub struct Kernel {
     pub source: String,
     /// SPIR-V without optimisation, with all names.
     pub for_reflection: Vec<u32>,
-    /// Optimised SPIR-V, as bytes.
+    /// Optimised SPIR-V, as bytes; empty for a kernel on cooperative matrices if the compiler does not know them.
     pub shipped: Vec<u8>,
+}
+
+/// Include of the shaders that need cooperative matrices.
+const MATRICES: &str = "inc/matrices.glsl";
+/// Definition with which such a shader declares its buffers and constants only.
+const DECLARATIONS_ONLY: &str = "DECLARATIONS_ONLY";
+
+/// Tells whether the compiler knows cooperative matrices; those of older systems do not.
+fn knows_matrices(compiler: &shaderc::Compiler) -> Result<bool, Failure> {
+    let source = "#version 450\n#extension GL_KHR_cooperative_matrix : require\nvoid main() {}";
+    let mut options = shaderc::CompileOptions::new()?;
+    options.set_target_env(shaderc::TargetEnv::Vulkan, shaderc::EnvVersion::Vulkan1_2 as u32);
+    let probe = compiler.compile_into_spirv(source, shaderc::ShaderKind::Compute, "probe", "main", Some(&options));
+    Ok(probe.is_ok())
 }
 
 /// Compiles every shader and every variant; shaders in the order of their names.
 pub fn kernels(glsl: &Path) -> Result<Vec<Kernel>, Failure> {
     let variants = read_variants(&glsl.join("variants.txt"))?;
     let compiler = shaderc::Compiler::new()?;
+    let knows_matrices = knows_matrices(&compiler)?;
     let entries = |folder: &Path| -> Result<Vec<PathBuf>, Failure> {
         Ok(fs::read_dir(folder)?.filter_map(|entry| entry.ok().map(|e| e.path())).collect())
     };
@@ -43,10 +58,14 @@ pub fn kernels(glsl: &Path) -> Result<Vec<Kernel>, Failure> {
         let source = fs::read_to_string(&path)?;
         let mut builds = vec![(shader.clone(), Vec::new())];
         builds.extend(variants.get(&shader).cloned().unwrap_or_default());
-        for (name, defines) in builds {
+        let declarations_only = !knows_matrices && source.contains(MATRICES);
+        for (name, mut defines) in builds {
+            if declarations_only {
+                defines.push((DECLARATIONS_ONLY.to_owned(), "1".to_owned()));
+            }
             let build = |optimise| compile(&compiler, glsl, &path, &source, &defines, optimise);
             let for_reflection = build(false)?.as_binary().to_vec();
-            let shipped = build(true)?.as_binary_u8().to_vec();
+            let shipped = if declarations_only { Vec::new() } else { build(true)?.as_binary_u8().to_vec() };
             let (shader, source) = (shader.clone(), source.clone());
             kernels.push(Kernel { shader, name, defines, source, for_reflection, shipped });
         }

@@ -135,7 +135,7 @@ pub fn run(gpu: &Gpu, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<Re
     let chosen = Tuning::for_device(gpu.info());
     let on = |layers| chosen.clone().with_layers(layers, String::new());
     let (f32_layers, matrices) = (on(Layers::F32), on(Layers::Matrices));
-    let has_matrices = !gpu.info().matrices.is_empty();
+    let has_matrices = stages::matrix_shape(gpu.info()).is_some();
     let mut parts = other_parts(gpu, &f32_layers);
     parts.extend(network_parts(gpu, &even, &dataset, &f32_layers));
     if has_matrices {
@@ -152,10 +152,7 @@ pub fn run(gpu: &Gpu, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<Re
     }
     let mut paths = chosen.reasons.clone();
     if !has_matrices {
-        paths.push(
-            "matrix layers are not tested, because the device has no cooperative matrices that our kernels can use"
-                .into(),
-        );
+        paths.push(format!("matrix layers are not tested, because {}", stages::why_no_matrices()));
     }
     let rows = findings.rows().to_vec();
     Ok(Report { untested: untested(gpu, &rows), rows, errors, paths })

@@ -40,6 +40,9 @@ layout(binding = 11) readonly buffer B11 { uvec4 dz16[]; };
 layout(binding = 12) writeonly buffer B12 { uvec4 dz_in16[]; };
 layout(binding = 13) buffer B13 { float partials[]; };
 layout(binding = 14) readonly buffer B14 { float sigma_gradient[]; };
+#ifdef DECLARATIONS_ONLY
+void main() {}
+#else
 #include "inc/sample_gradient.glsl"
 // Shared memory holds in turn the last layer's activations, the input of the upper layer and the input of the lower layer.
 #define INPUTS_SIZE tile * (longest_stride > dz_stride ? longest_stride : dz_stride)
@@ -168,3 +171,4 @@ void main() {
     put_sums();
     if (push.out_weights != NOWHERE) put_output_sums();
 }
+#endif

@@ -28,6 +28,9 @@ layout(binding = 7) readonly buffer B7 { uvec4 weights16[]; };
 layout(binding = 8) readonly buffer B8 { float bias_rows[]; };
 layout(binding = 9) readonly buffer B9 { uvec4 dz16[]; };
 layout(binding = 10) buffer B10 { float partials[]; };
+#ifdef DECLARATIONS_ONLY
+void main() {}
+#else
 #include "inc/encode_tile.glsl"
 // Activations, followed by the encoding.
 #define INPUTS_SIZE tile * (input_stride + lower_stride)
@@ -90,3 +93,4 @@ void main() {
     [[dont_unroll]] for (uint t = gl_WorkGroupID.x; t < tiles; t += gl_NumWorkGroups.x) walk_tile(t * tile);
     put_sums();
 }
+#endif

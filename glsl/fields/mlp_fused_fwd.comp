@@ -32,6 +32,9 @@ layout(binding = 9) readonly buffer B9 { float params[]; };
 layout(binding = 10) writeonly buffer B10 { uvec4 features16[]; };
 layout(binding = 11) writeonly buffer B11 { uvec4 activations16[]; };
 layout(binding = 12) writeonly buffer B12 { vec2 sample_sigma[]; };
+#ifdef DECLARATIONS_ONLY
+void main() {}
+#else
 #include "inc/encode_tile.glsl"
 
 const uint width8 = width / 8u;
@@ -135,3 +138,4 @@ void main() {
         sample_sigma[first + row] = setup.dynamic_gain * vec2(softplus(x), sigmoid(x));
     }
 }
+#endif

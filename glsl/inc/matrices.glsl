@@ -1,9 +1,12 @@
 // Cooperative matrices: f16 operands, f32 sums, subgroup scope. The shapes are among those that the device reports. Arrays of
 // f16 are declared as uvec4 with eight numbers per element, for wide copies; offsets and strides are in uvec4. This file must
-// be included first, because it contains extensions.
+// be included first, because it contains extensions. With DECLARATIONS_ONLY, shaders end after their buffers and constants: a compiler
+// that does not know cooperative matrices still compiles the interface.
 #pragma use_vulkan_memory_model
 #extension GL_KHR_memory_scope_semantics : require
+#ifndef DECLARATIONS_ONLY
 #extension GL_KHR_cooperative_matrix : require
+#endif
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_EXT_shader_explicit_arithmetic_types_float16 : require
 #extension GL_EXT_control_flow_attributes : require
@@ -31,7 +34,8 @@ const float LARGEST = 65504.0;
 
 // STORE_F16 converts sums to f16 in registers and stores them in the rows of an array of uvec4. On a device without matrices of
 // f16 sums, which must not even be declared there, it converts them in shared memory.
-#ifdef F32_SUMS
+#ifdef DECLARATIONS_ONLY
+#elif defined(F32_SUMS)
 #define GRADIENT SUM
 shared float sum_tile[subgroups * m * n];
 

@@ -6,6 +6,9 @@
 layout(push_constant) uniform Push { uint steps; } push;
 layout(binding = 0) readonly buffer B0 { uvec4 operands16[]; };
 layout(binding = 1) writeonly buffer B1 { float sink[]; };
+#ifdef DECLARATIONS_ONLY
+void main() {}
+#else
 
 void main() {
     LEFT left[2];
@@ -22,3 +25,4 @@ void main() {
     uint at = (gl_WorkGroupID.x * subgroups + gl_SubgroupID) * m * n;
     coopMatStore((sums[0] + sums[1]) + (sums[2] + sums[3]), sink, at, n, ROWS);
 }
+#endif

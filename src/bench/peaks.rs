@@ -7,7 +7,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
 use crate::kernels::dispatch::{Binding, dispatch};
 use crate::kernels::push::{self, PushConstants};
-use crate::kernels::stages::{Build, Stage};
+use crate::kernels::stages::{Build, Stage, matrix_shape};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
@@ -66,8 +66,8 @@ pub fn peaks(gpu: &Gpu) -> Result<Peaks> {
     let seconds = best_seconds(gpu, &stage, [lanes / stage.local_size(), 1, 1], &[(Binding::sink, &sink)], push)?;
     let f32_tflops = f64::from(lanes) * f64::from(steps) * 32.0 * 12.0 * 2.0 / seconds * 1e-12;
 
-    let matrix_tflops = match info.matrices.first() {
-        Some(shape) => Some(matrix_peak(gpu, *shape)?),
+    let matrix_tflops = match matrix_shape(info) {
+        Some(shape) => Some(matrix_peak(gpu, shape)?),
         None => None,
     };
 

@@ -3,6 +3,7 @@
 
 use crate::error::{Error, Result};
 use crate::gpu::buffer::Operands;
+use crate::gpu::capabilities::{DeviceInfo, MatrixShape};
 use crate::gpu::device::Gpu;
 use crate::gpu::pipeline::{BindingCode, BindingKind, KernelCode, Pipeline};
 use crate::gpu::record::{Groups, MAX_GROUPS};
@@ -13,6 +14,29 @@ use std::marker::PhantomData;
 use std::sync::Arc;
 
 include!(concat!(env!("OUT_DIR"), "/table.rs"));
+
+/// Reason why a build has no kernels on cooperative matrices, and its remedy.
+pub const NO_MATRIX_KERNELS: &str = "this build has no kernels on cooperative matrices (its shaderc does not know them: run \
+                                     tools/shaderc, which makes one that does, and build again)";
+
+/// Tells whether this build has the kernels on cooperative matrices; see [`NO_MATRIX_KERNELS`].
+pub fn has_matrix_kernels() -> bool {
+    KERNEL_TABLE.iter().all(|kernel| !kernel.spirv.is_empty())
+}
+
+/// Returns the shape of the cooperative matrices that kernels of this build use on a device; none where the device has none, or the
+/// build has no kernels for them.
+pub fn matrix_shape(info: &DeviceInfo) -> Option<MatrixShape> {
+    info.matrices.first().copied().filter(|_| has_matrix_kernels())
+}
+
+/// Returns the reason why there are no matrix layers on a device for which [`matrix_shape`] returns none.
+pub fn why_no_matrices() -> &'static str {
+    match has_matrix_kernels() {
+        true => "the device has no cooperative matrices that our kernels can use",
+        false => NO_MATRIX_KERNELS,
+    }
+}
 
 /// Finds a compiled kernel by its name, variants included.
 ///
@@ -110,6 +134,9 @@ impl Build<'_> {
         let variant = if subgroup.is_some() { EXCHANGING } else { self.variant };
         let integers = if self.int64 && is_plain && gpu.info().int64_atomics { INT64 } else { "" };
         let code = kernel_code(&format!("{}{variant}{integers}", P::SHADER))?;
+        if code.spirv.is_empty() {
+            return Err(Error::config("layers", "matrices", NO_MATRIX_KERNELS));
+        }
         let pipeline = if self.matrices {
             gpu.matrix_pipeline(code, lanes, self.constants)?
         } else if let Some(size) = subgroup {

@@ -5,6 +5,7 @@ use crate::gpu::capabilities::{DeviceInfo, DeviceKind, Vendor};
 use crate::gpu::pace::longest_submit_s;
 use crate::kernels::constants;
 use crate::kernels::push::{MarchLoss, PushConstants};
+use crate::kernels::stages::{matrix_shape, why_no_matrices};
 use serde::Serialize;
 use strum::{IntoStaticStr, VariantArray};
 
@@ -213,11 +214,9 @@ impl Tuning {
         } else {
             (64, 32, 16)
         };
-        let (layers, why) = match info.matrices.first() {
-            None => (
-                Layers::F32,
-                "f32 layers, because the device has no cooperative matrices that our kernels can use".to_owned(),
-            ),
+        let shape = matrix_shape(info);
+        let (layers, why) = match shape {
+            None => (Layers::F32, format!("f32 layers, because {}", why_no_matrices())),
             Some(_) if info.is_cpu() => (
                 Layers::F32,
                 "f32 layers, because a CPU emulates cooperative matrices, which is several times slower".to_owned(),
@@ -230,7 +229,7 @@ impl Tuning {
             Some(s) => (Layers::Matrices, format!("matrix layers, {}x{}x{}: f16 operands, f32 sums", s.m, s.n, s.k)),
         };
         reasons.push(why);
-        let f16_sums = info.matrices.first().is_some_and(|s| s.f16_sums);
+        let f16_sums = shape.is_some_and(|s| s.f16_sums);
         let matrices = MatrixTuning { f16_sums, ..MatrixTuning::for_device(info) };
         // Some kilobytes per sample must fit beside everything else. The limit depends on total memory, not on free memory:
         // other chunks round a batch's sums differently, and runs on one device must repeat bit by bit.
@@ -268,7 +267,7 @@ impl Tuning {
 
     /// Tells whether matrices may be faster on a device, so that timing both paths is worthwhile.
     pub fn has_choice(info: &DeviceInfo) -> bool {
-        !info.is_cpu() && !info.matrices.is_empty()
+        !info.is_cpu() && matrix_shape(info).is_some()
     }
 
     /// Returns `line_params` if that many sums fit the shared memory reserved for them, else 0; this is `private_lines` of

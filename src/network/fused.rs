@@ -20,7 +20,7 @@ use crate::kernels::constants::NOWHERE;
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
 use crate::kernels::layout::Setup;
 use crate::kernels::push;
-use crate::kernels::stages::{Build, Stage};
+use crate::kernels::stages::{Build, Stage, matrix_shape, why_no_matrices};
 use crate::kernels::tuning::{MatrixTuning, Tuning};
 use crate::model::params::NetworkMap;
 use crate::network::chunk::Chunk;
@@ -201,9 +201,9 @@ impl FusedNetwork {
         purpose: Purpose,
     ) -> Result<FusedNetwork> {
         let info = gpu.info();
-        let matrix = *info.matrices.first().ok_or_else(|| {
-            let problem = "this device has no cooperative matrices that our kernels can use: choose f32 or auto";
-            Error::config("layers", "matrices", format!("{}: {problem}", info.name))
+        let matrix = matrix_shape(info).ok_or_else(|| {
+            let problem = format!("{}: {}; choose f32 or auto", info.name, why_no_matrices());
+            Error::config("layers", "matrices", problem)
         })?;
         let shape = Shape::new(info, matrix, &tuning.matrices, params)?;
         let builder = Builder { gpu, shape: &shape, params, tuning: &tuning.matrices };

@@ -94,6 +94,7 @@ fn run_sanitized(compiler: &str, dir: &Path) {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn embed_is_clean_under_sanitizers() {
     let dir = tempfile::tempdir().unwrap();
     run_sanitized("gcc", dir.path());
@@ -131,6 +132,7 @@ fn embed_is_clean_under_valgrind() {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn a_process_may_load_close_and_fork() {
     let dir = tempfile::tempdir().unwrap();
     let binary = compile("gcc", &["-std=c99", "-Wno-pedantic"], &root().join("tests/capi/process.c"), dir.path());

@@ -26,6 +26,7 @@ fn evaluation(run: &Path) -> Value {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn scores_in_3d_are_made_where_the_reconstruction_is() {
     let directory = tempfile::tempdir().unwrap();
     for (name, wrong, max_as_stated) in [

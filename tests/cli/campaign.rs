@@ -17,6 +17,7 @@ fn part(out: &Path) -> Value {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn a_campaign_keeps_each_step_and_goes_on() {
     let dir = tempfile::tempdir().unwrap();
     let (program, out) = (env!("CARGO_BIN_EXE_nertca-vk"), dir.path().join("campaign"));

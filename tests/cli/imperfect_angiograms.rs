@@ -47,6 +47,7 @@ fn dice(directory: &Path, imperfection: &[&str]) -> f64 {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn imperfect_angiograms_cost_little() {
     let measured = |imperfection: &[&str]| dice(tempfile::tempdir().unwrap().path(), imperfection);
     let perfect = measured(&[]);
@@ -60,6 +61,7 @@ fn imperfect_angiograms_cost_little() {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn frames_between_phases_are_fitted_at_their_own_time() {
     let dir = tempfile::tempdir().unwrap();
     let [data, run, again] = ["data", "run", "again"].map(|name| dir.path().join(name));

@@ -380,7 +380,7 @@ fn malformed_datasets_are_named_file_and_field() {
 
 #[test]
 fn usage_errors_have_their_exit_codes() {
-    fails(&["train"], 2, &["DATA"]);
+    fails(&["train"], 2, &["DATA", "nertca-vk phantom heart", "import dicom"]);
     fails(&["train", "x", "-o", "y", "--set", "train.rayz=1"], 2, &["train.rayz"]);
     fails(&["train", "x", "-o", "y", "--config", "absent.toml"], 1, &["absent.toml"]);
     fails(&["--device", "no such device", "phantom", "never-made"], 3, &["no such device"]);
@@ -400,6 +400,37 @@ fn usage_errors_have_their_exit_codes() {
     assert!(details["int64"].is_boolean() && details["buffer_int64_atomics"].is_boolean(), "{details}");
     assert!(names("queues").contains("compute") && names("queues").contains("timestamp_bits"), "{details}");
     assert!(names("extensions").contains("VK_KHR_") && names("heaps").contains("device_local"), "{details}");
+}
+
+#[test]
+fn a_first_session_needs_no_manual() {
+    let directory = tempfile::tempdir().unwrap();
+    let shown = |args: &[&str]| {
+        let out = program().args(args).current_dir(&directory).output().unwrap();
+        let said = [out.stdout, out.stderr].map(|bytes| String::from_utf8(bytes).unwrap());
+        (out.status.code(), said.concat())
+    };
+    let (code, help) = shown(&[]);
+    assert_eq!(code, Some(2));
+    assert_eq!(shown(&["--help"]), (Some(0), help.clone()));
+    assert!(help.starts_with("4D reconstruction") && shown(&["--version"]).1.starts_with("nertca-vk "), "{help}");
+    // The first steps are those that follow, in a smaller size.
+    let steps = help.split("First steps:").nth(1).unwrap();
+    for step in ["nertca-vk phantom heart ", "nertca-vk train heart ", "nertca-vk view heart-run "] {
+        assert!(steps.contains(step), "{steps}");
+    }
+    assert_eq!(shown(&["phantom", "heart", "--size", "32", "--phases", "3"]).0, Some(0));
+    let settings =
+        ["--set", "train.iterations=12", "--set", "gaussians.iterations=10", "--set", "march.render_samples=24"];
+    let (code, said) = shown(&[&["train", "heart"], &settings[..]].concat());
+    assert_eq!(code, Some(0), "{said}");
+    let last: Vec<&str> =
+        said.lines().filter(|line| line.starts_with("report: ") || line.starts_with("next: ")).collect();
+    assert_eq!(last.len(), 2, "{said}");
+    assert!(last[0].ends_with("heart-run/report.html") && last[1].starts_with("next: nertca-vk view \"heart-run\""));
+    assert!(said.contains("Dice") && directory.path().join("heart-run/report.html").is_file(), "{said}");
+    // A second run does not replace the first.
+    assert_eq!(shown(&["train", "heart"]).0, Some(2));
 }
 
 #[test]
@@ -431,6 +462,7 @@ fn ctrl_c_saves_and_exits_130() {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn measurements_and_baked_views() {
     let directory = tempfile::tempdir().unwrap();
     let data = phantom(directory.path(), &[]);
@@ -535,6 +567,7 @@ fn signal(child: &std::process::Child, name: &str) {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 #[cfg(unix)]
 fn scoring_stops_when_told_and_can_be_left_for_later() {
     let directory = tempfile::tempdir().unwrap();

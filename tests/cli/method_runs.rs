@@ -81,6 +81,7 @@ fn trains_resumes_scores_draws_exports_and_times(method: &Method, check_score: i
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn r2_gaussian_trains_resumes_scores_draws_exports_and_times() {
     let method = Method {
         preset: "r2-gaussian",
@@ -130,6 +131,7 @@ fn sax_nerf_trains_resumes_scores_draws_exports_and_times() {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn x_gaussian_trains_resumes_scores_draws_exports_and_times() {
     let method = Method {
         preset: "x-gaussian",

@@ -153,6 +153,7 @@ fn our_studies_can_be_run() {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn what_changed_runs_again_and_nothing_else() {
     let directory = tempfile::tempdir().unwrap();
     let (file, out) = (written(directory.path(), TINY), directory.path().join("out"));
@@ -201,6 +202,7 @@ fn what_changed_runs_again_and_nothing_else() {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn a_run_that_fails_is_a_row() {
     let directory = tempfile::tempdir().unwrap();
     let out = directory.path().join("out");
@@ -237,6 +239,7 @@ fn a_run_that_fails_is_a_row() {
 
 #[cfg(unix)]
 #[test]
+#[ignore = "long: tools/test --all"]
 fn two_processes_share_a_study() {
     let directory = tempfile::tempdir().unwrap();
     let (file, out) = (written(directory.path(), TINY), directory.path().join("out"));
@@ -286,6 +289,7 @@ fn timeless(out: &Path) -> Vec<String> {
 
 #[cfg(unix)]
 #[test]
+#[ignore = "long: tools/test --all"]
 fn kills_change_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let [whole, killed] = ["whole", "killed"].map(|name| directory.path().join(name));
@@ -318,6 +322,7 @@ fn kills_change_nothing() {
 
 #[cfg(unix)]
 #[test]
+#[ignore = "long: tools/test --all"]
 fn ctrl_c_saves() {
     let directory = tempfile::tempdir().unwrap();
     let out = directory.path().join("out");

@@ -305,6 +305,7 @@ fn interrupted_after_a_third_run(iterations: u32, far: impl Fn(&Value) -> bool) 
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn what_was_trained_stays_until_training_with_a_later_run_has_come_as_far() {
     let (said, left) = interrupted_after_a_third_run(400, |about| about["state"] == "trained");
     assert_eq!(left, 2, "{said}");

@@ -67,7 +67,7 @@ pub fn ok(args: &[&str]) -> (String, String) {
 }
 
 pub struct Trained {
-    _directory: tempfile::TempDir,
+    pub directory: tempfile::TempDir,
     pub data: PathBuf,
     pub run: PathBuf,
 }
@@ -81,7 +81,7 @@ pub fn trained() -> &'static Trained {
         // The detector is off centre, so that errors in its handling are detected.
         phantom(&data, PHASES, &["--size", "64", "--offset", "2.5,-1.5"]);
         train(&data, &run, &["--iterations", "60", "--set", "gaussians.iterations=60", "--tree"]);
-        Trained { _directory: directory, data, run }
+        Trained { directory, data, run }
     })
 }
 

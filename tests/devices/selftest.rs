@@ -40,6 +40,7 @@ fn many_gaussians(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
 
 /// Faults in the shader code that the driver receives: each is found in the row of its stage, and in no earlier row.
 #[test]
+#[ignore = "long: tools/test --all"]
 fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
     faults::expect_found(&[
         fault("gaussian_moments", wrong_sign, gaussians::compare),

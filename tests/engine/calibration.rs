@@ -41,6 +41,7 @@ fn calibrated(shot: &Shot, mode: &str) -> (Calibration, f64) {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn views_are_brought_together() {
     let gpu = gpu();
     let studio = Studio::new(&gpu, 100, 1);
@@ -97,6 +98,7 @@ fn with_blades(shot: &mut Shot, views: usize, share: f64) {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn blades_do_not_pull_views_apart() {
     let gpu = gpu();
     let studio = Studio::new(&gpu, 100, 1);
@@ -133,6 +135,7 @@ fn dice(gpu: &Gpu, dataset: &Dataset) -> f64 {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn a_calibrated_run_is_as_good_as_one_with_true_geometry() {
     let gpu = gpu();
     let studio = Studio::new(&gpu, 100, 1);

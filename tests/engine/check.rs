@@ -103,6 +103,7 @@ fn told(dataset: &Dataset) -> Check {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn sound_data_raise_no_alarm() {
     for n_views in [4, 3] {
         for (seed, angle_deg, noise) in [(1, 0.0, 0.0), (2, 0.0, 0.0), (3, 0.3, 0.0), (4, 0.0, 0.03), (5, 0.3, 0.03)] {

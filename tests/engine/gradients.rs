@@ -48,6 +48,7 @@ fn a_sleeping_field_is_called_back() {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     for (preset, settings) in [
         ("paper", &["dynamic.occlusion=1e-3", "loss.normalise=true"][..]),

@@ -142,6 +142,7 @@ fn a_cropped_view_has_the_rays_and_pixels_it_had() {
 
 /// One mistake tried by `check` turns images on their side, which changes the canvas.
 #[test]
+#[ignore = "long: tools/test --all"]
 fn unseen_images_of_another_shape_change_no_check() {
     let (gpu, directory) = (gpu(), tempfile::tempdir().unwrap());
     let full = phantom(&gpu, &directory.path().join("full"), SIZE, 4);
@@ -159,6 +160,7 @@ fn unseen_images_of_another_shape_change_no_check() {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn a_reconstruction_of_cropped_views_is_as_good_and_scored_on_what_they_show() {
     let (gpu, directory) = (gpu(), tempfile::tempdir().unwrap());
     let full = phantom(&gpu, &directory.path().join("full"), SIZE, 4);

@@ -91,6 +91,7 @@ fn dice(gpu: &Gpu, session: &Session, dataset: &Dataset) -> f64 {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn gaussians_go_on_where_they_explain_what_is_new() {
     let gpu = gpu();
     let (directory, dataset) = phantom(&gpu);

@@ -29,6 +29,7 @@ fn ray_lanes(gpu: &Gpu) -> [u32; 2] {
 }
 
 #[test]
+#[ignore = "long: tools/test --all"]
 fn every_stage_matches_with_and_without_subgroups() {
     for without in [false, true] {
         let gpu = open(without);

@@ -21,9 +21,17 @@ use super::watch::{self, WatchArgs};
 use clap::{CommandFactory, Parser, Subcommand};
 use nertca_vk::error::Result;
 
+/// Commands of a first session, below the list of all.
+const FIRST_STEPS: &str = "\
+First steps:
+  nertca-vk phantom heart          make a synthetic dataset in the directory `heart`
+  nertca-vk train heart            reconstruct it; the run is in `heart-run`, its page in `heart-run/report.html`
+  nertca-vk view heart-run         turn the C-arm in a browser while the beat plays
+Angiograms of your own: nertca-vk import dicom --help; without DICOM, docs/formats.md describes `dataset.json`.";
+
 /// 4D reconstruction of the beating coronary arteries from 3 or 4 X-ray angiography views.
 #[derive(Debug, Parser)]
-#[command(name = "nertca-vk", version, arg_required_else_help = true)]
+#[command(name = "nertca-vk", version, arg_required_else_help = true, after_help = FIRST_STEPS)]
 pub struct Cli {
     /// Options that every command accepts.
     #[command(flatten)]

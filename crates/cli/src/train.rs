@@ -6,6 +6,7 @@ use super::progress::{print_json, show_progress, stop_flag};
 use super::report::Report;
 use super::tree::{of_page as tree_of_page, remove_old as remove_old_tree, score as score_tree_of_page};
 use clap::Args;
+use clap::error::ErrorKind;
 use nertca_vk::checkpoint::{self, newest_model};
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
@@ -25,10 +26,9 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, Args)]
 pub struct TrainArgs {
     /// Dataset directory (native or authors' layout).
-    #[arg(required_unless_present = "print_config")]
     pub data: Option<PathBuf>,
-    /// Run directory.
-    #[arg(short, long, value_name = "RUN", required_unless_present = "print_config")]
+    /// Run directory; by default the name of DATA with `-run`, in the current directory.
+    #[arg(short, long, value_name = "RUN")]
     pub out: Option<PathBuf>,
     /// Hyper-parameters.
     #[command(flatten)]
@@ -66,6 +66,18 @@ pub struct TrainArgs {
     pub export_hull: Option<PathBuf>,
 }
 
+/// Message for a command line without a dataset.
+const NO_DATA: &str = "the directory of a dataset is missing: nertca-vk train DATA. Make a synthetic one with `nertca-vk phantom \
+                       heart`, or one of angiograms with `nertca-vk import dicom FILE... -o DATA`\n";
+
+/// Returns the directory of a run whose user named none: the name of its dataset with `-run`, in the current directory.
+fn default_run(data: &Path) -> Result<PathBuf> {
+    let named = data.canonicalize().map_err(Error::io("read", data))?;
+    let mut name = named.file_name().unwrap_or("dataset".as_ref()).to_owned();
+    name.push("-run");
+    Ok(PathBuf::from(name))
+}
+
 fn config(args: &TrainArgs) -> Result<Config> {
     let iterations = args.iterations.map(|n| format!("train.iterations={n}"));
     args.config.load(iterations.into_iter().chain(args.seed.map(|s| format!("seed={s}"))))
@@ -78,10 +90,11 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
         out!("{}", config.acting_toml()?.trim_end());
         return Ok(());
     }
-    let (Some(data), Some(run)) = (&args.data, &args.out) else {
-        return Err(Error::Internal("clap requires DATA and --out".into()));
+    let Some(data) = &args.data else {
+        clap::Error::raw(ErrorKind::MissingRequiredArgument, NO_DATA).exit();
     };
     let dataset = Dataset::open(data)?;
+    let run = &args.out.clone().map_or_else(|| default_run(data), Ok)?;
     if let Some(file) = &args.export_hull {
         return export_hull(&config, &dataset, file);
     }
@@ -140,9 +153,12 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
         pictures: &report,
     }
     .write(&page)?;
-    if let Some(evaluation) = evaluation.as_ref().filter(|_| !args.json) {
-        print_table(evaluation);
-        out!("report: {}, pictures: {}", page.display(), report.display());
+    if !args.json {
+        if let Some(evaluation) = &evaluation {
+            print_table(evaluation);
+        }
+        out!("report: {}", page.display());
+        out!("next: nertca-vk view \"{}\"   (turn the C-arm in a browser while the beat plays)", run.display());
     }
     warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
     global.close_device(&gpu)
