@@ -28,6 +28,7 @@ use crate::methods;
 use crate::scan::dataset::Dataset;
 use compare::{Findings, Row};
 use serde::Serialize;
+use std::time::Instant;
 
 /// Stages that measure a device's limits: their results are not used.
 const MEASURING: [&str; 3] = [push::PeakCopy::SHADER, push::PeakF32::SHADER, push::PeakMatrix::SHADER];
@@ -64,6 +65,27 @@ impl Report {
     pub fn is_ok(&self) -> bool {
         self.errors.is_empty() && self.failed().next().is_none() && !self.rows.is_empty()
     }
+}
+
+/// Progress of a self-test.
+#[derive(Debug)]
+pub enum Progress<'a> {
+    /// A part begins.
+    Begun {
+        /// Name of the part.
+        part: &'a str,
+        /// Parts before it.
+        done: usize,
+        /// All parts.
+        parts: usize,
+    },
+    /// A part has ended.
+    Ended {
+        /// Rows to which the part has added comparisons, as they are now.
+        rows: &'a [Row],
+        /// Duration of the part, seconds.
+        seconds: f64,
+    },
 }
 
 /// A part of the test.
@@ -125,12 +147,11 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<TestPart<'a>> {
     ]
 }
 
-/// Compares every stage that the device can run with its twin. `progress` receives the name of each part that begins, the
-/// number of parts before it, and the number of all.
+/// Compares every stage that the device can run with its twin. `progress` is called when a part begins and when it has ended.
 ///
 /// # Errors
 /// [`Error::DeviceLost`], after which nothing can be compared; other errors are part of the report.
-pub fn run(gpu: &Gpu, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<Report> {
+pub fn run(gpu: &Gpu, progress: &mut dyn FnMut(Progress<'_>)) -> Result<Report> {
     let (even, dataset) = (problems::small_dataset(13, 11, 3)?, problems::uneven_dataset(13, 11)?);
     let chosen = Tuning::for_device(gpu.info());
     let on = |layers| chosen.clone().with_layers(layers, String::new());
@@ -143,8 +164,13 @@ pub fn run(gpu: &Gpu, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<Re
     }
     let (mut findings, mut errors) = (Findings::default(), Vec::new());
     for (at, (part, compare)) in parts.iter().enumerate() {
-        progress(part, at, parts.len());
-        match compare(&mut findings) {
+        progress(Progress::Begun { part, done: at, parts: parts.len() });
+        let (begin, before) = (Instant::now(), findings.rows().to_vec());
+        let outcome = compare(&mut findings);
+        let touched = |(at, row): &(usize, &Row)| before.get(*at).is_none_or(|old| old.cases != row.cases);
+        let rows: Vec<Row> = findings.rows().iter().enumerate().filter(touched).map(|(_, row)| row.clone()).collect();
+        progress(Progress::Ended { rows: &rows, seconds: begin.elapsed().as_secs_f64() });
+        match outcome {
             Ok(()) => {}
             Err(lost @ Error::DeviceLost { .. }) => return Err(lost),
             Err(error) => errors.push(Failure { part: part.clone(), error: error.to_string() }),

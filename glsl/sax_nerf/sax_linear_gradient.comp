@@ -25,10 +25,7 @@ layout(binding = 4) buffer B4 { float sax_weight_parts[]; };
 uint begin;
 uint end;
 
-void keep(uint number, float sum) {
-    uint place = gl_WorkGroupID.x * sax_setup.n_weights + number;
-    sax_weight_parts[place] = sum + (push.adds != 0u ? sax_weight_parts[place] : 0.0);
-}
+uint place_of_part(uint number) { return gl_WorkGroupID.x * sax_setup.n_weights + number; }
 
 float column_of(SaxProduct product, uint k, uint s) {
     if (product.right == SAX_FEATURES)
@@ -52,11 +49,16 @@ void add_product(SaxProduct product, uint first) {
             [[unroll]] for (uint i = 0u; i < INPUTS; i++) sums[j][i] += d * x[i];
         }
     }
+    // One branch for all sums: a branch for each of them costs some compilers of CPU drivers gigabytes.
     [[unroll]] for (uint i = 0u; i < INPUTS; i++) {
         if (columns[i] >= 4u * product.columns) continue;
-        [[unroll]] for (uint j = 0u; j < WIDTH4; j++) {
-            [[unroll]] for (uint c = 0u; c < 4u; c++)
-                keep(4u * (product.first + (4u * j + c) * product.stride) + columns[i], sums[j][i][c]);
+        uint place = place_of_part(4u * product.first + columns[i]);
+        if (push.adds != 0u) {
+            [[unroll]] for (uint row = 0u; row < 4u * WIDTH4; row++)
+                sax_weight_parts[place + 4u * row * product.stride] += sums[row / 4u][i][row % 4u];
+        } else {
+            [[unroll]] for (uint row = 0u; row < 4u * WIDTH4; row++)
+                sax_weight_parts[place + 4u * row * product.stride] = sums[row / 4u][i][row % 4u];
         }
     }
 }
@@ -66,7 +68,9 @@ void add_vector(SaxProduct product) {
     for (uint i = gl_LocalInvocationID.x; i < WIDTH4; i += gl_WorkGroupSize.x) {
         vec4 sum = vec4(0.0);
         for (uint s = begin; s < end; s++) sum += operand(product.left, i, s);
-        [[unroll]] for (uint c = 0u; c < 4u; c++) keep(4u * (product.first + i) + c, sum[c]);
+        uint place = place_of_part(4u * (product.first + i));
+        [[unroll]] for (uint c = 0u; c < 4u; c++)
+            sax_weight_parts[place + c] = sum[c] + (push.adds != 0u ? sax_weight_parts[place + c] : 0.0);
     }
 }
 

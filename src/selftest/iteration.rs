@@ -331,10 +331,11 @@ impl Tolerances {
     }
 }
 
-/// Factor on the network's tolerances on a device. Vulkan allows sine and cosine an error of 2^-11, which CPU drivers stay far
-/// below. Faults are far larger than that.
+/// Factor on the network's tolerances on a device. Vulkan allows sine and cosine an error of 2^-11, which llvmpipe stays far below.
+/// SwiftShader uses it up: its gradients deviate by up to 2.7e-3, where 1e-4 are tolerated without the factor.
 pub fn sine_factor(info: &DeviceInfo) -> f64 {
-    if info.is_cpu() { 1.0 } else { 10.0 }
+    const OF_ALLOWED_ERROR: f64 = 50.0;
+    if info.is_llvmpipe { 1.0 } else { OF_ALLOWED_ERROR }
 }
 
 impl Twin<'_> {

@@ -10,7 +10,7 @@ use nertca_vk::error::Result;
 use nertca_vk::fields::state::FieldsState;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::DeviceState;
-use nertca_vk::kernels::stages::kernel_code;
+use nertca_vk::kernels::stages::{has_matrix_kernels, kernel_code, matrix_shape, why_no_matrices};
 use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};
 use nertca_vk::plan::Plan;
 use nertca_vk::selftest::compare::Findings;
@@ -19,12 +19,17 @@ use nertca_vk::selftest::iteration::{self, Case, MATRIX_CASES, MATRIX_CASES_BETW
 use nertca_vk::train::calibrate::{self, Verdict};
 use nertca_vk::train::trainer::Trainer;
 
+/// Says that a test checks nothing, which `NERTCA_MATRICES=require` forbids.
+fn skip(why: &str) {
+    assert!(std::env::var("NERTCA_MATRICES").is_err(), "{why}");
+    eprintln!("SKIPPED: {why}");
+}
+
 /// A device and its matrix path, if it has one.
 fn matrices() -> Option<(Gpu, Tuning)> {
     let gpu = gpu();
-    if gpu.info().matrices.is_empty() {
-        assert!(std::env::var("NERTCA_MATRICES").is_err(), "{} has no cooperative matrices", gpu.info().name);
-        eprintln!("SKIPPED: {} has no cooperative matrices", gpu.info().name);
+    if matrix_shape(gpu.info()).is_none() {
+        skip(&format!("{}: {}", gpu.info().name, why_no_matrices()));
         return None;
     }
     let tuning = Tuning::for_device(gpu.info()).with_layers(Layers::Matrices, String::new());
@@ -110,6 +115,9 @@ fn an_iteration_waits_where_it_must() {
 
 #[test]
 fn shaders_for_devices_without_f16_sums_have_none() {
+    if !has_matrix_kernels() {
+        return skip(why_no_matrices());
+    }
     const FLOAT_TYPE: u32 = 22;
     const CONSTANT: u32 = 43;
     const MATRIX_TYPE: u32 = 4456;

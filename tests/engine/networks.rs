@@ -7,6 +7,7 @@ use nertca_vk::config::{Config, Preset};
 use nertca_vk::fields::state::FieldsState;
 use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::gpu::device::Gpu;
+use nertca_vk::kernels::stages::matrix_shape;
 use nertca_vk::kernels::tuning::{Layers, Tuning};
 use nertca_vk::model::component::Component;
 use nertca_vk::plan::Plan;
@@ -29,7 +30,7 @@ fn paths(gpu: &Gpu) -> Vec<Tuning> {
         ..tuning(gpu).with_layers(Layers::F32, String::new())
     };
     let mut paths = vec![f32_layers(Operands::Texel, 8), f32_layers(Operands::Storage, 32)];
-    if !gpu.info().matrices.is_empty() {
+    if matrix_shape(gpu.info()).is_some() {
         paths.push(tuning(gpu).with_layers(Layers::Matrices, String::new()));
     } else {
         assert!(std::env::var("NERTCA_MATRICES").is_err(), "{} has no cooperative matrices", gpu.info().name);

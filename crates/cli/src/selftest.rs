@@ -4,7 +4,8 @@ use super::options::GlobalOptions;
 use clap::Args;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::capabilities::DeviceInfo;
-use nertca_vk::selftest::{self, Report};
+use nertca_vk::selftest::compare::Row;
+use nertca_vk::selftest::{self, Progress, Report};
 use serde::Serialize;
 use std::time::Instant;
 
@@ -32,7 +33,11 @@ struct Answer<'a> {
 pub fn run(global: &GlobalOptions, args: &SelftestArgs) -> Result<()> {
     let gpu = global.open_device()?;
     let begin = Instant::now();
-    let report = selftest::run(&gpu, &mut |part, done, of| eprintln!("{} of {of}: {part}", done + 1))?;
+    if !args.json {
+        out!("{} ({})", gpu.info().name, gpu.info().driver);
+        out!("{:9} {:>5} {:>9} {:>9}         stages", "path", "cases", "deviation", "tolerance");
+    }
+    let report = selftest::run(&gpu, &mut |progress| show(progress, args.json))?;
     let seconds = begin.elapsed().as_secs_f64();
     if args.json {
         let (version, commit) = (env!("CARGO_PKG_VERSION"), nertca_vk_study::COMMIT);
@@ -40,24 +45,35 @@ pub fn run(global: &GlobalOptions, args: &SelftestArgs) -> Result<()> {
         let answer = Answer { version, commit, device, ok, seconds, report: &report };
         out!("{}", nertca_vk::files::pretty_json(&answer)?);
     } else {
-        print(gpu.info(), &report, seconds);
+        print_end(&report, seconds);
     }
     global.close_device(&gpu)?;
     if report.is_ok() { Ok(()) } else { Err(Error::NoDevice(fault(gpu.info(), &report))) }
 }
 
-fn print(device: &DeviceInfo, report: &Report, seconds: f64) {
-    out!("{} ({})", device.name, device.driver);
-    report.paths.iter().for_each(|path| out!("- {path}"));
-    out!("{:9} {:>5} {:>9} {:>9}         stages", "path", "cases", "deviation", "tolerance");
-    for row in &report.rows {
-        let verdict = if row.is_ok() { "ok" } else { "FAILED" };
-        let (path, name) = (&row.path, row.name());
-        out!("{path:9} {:5} {:9.1e} {:9.1e} {verdict:7} {name}", row.cases, row.deviation, row.tolerance);
-        if !row.is_ok() {
-            out!("          in {}", row.seen_in);
+/// Prints each part when it begins, and its rows when it has ended.
+fn show(progress: Progress<'_>, json: bool) {
+    match progress {
+        Progress::Begun { part, done, parts } => eprintln!("{} of {parts}: {part}", done + 1),
+        Progress::Ended { .. } if json => {}
+        Progress::Ended { rows, seconds } => {
+            rows.iter().for_each(print_row);
+            eprintln!("   {seconds:.1} s");
         }
     }
+}
+
+fn print_row(row: &Row) {
+    let verdict = if row.is_ok() { "ok" } else { "FAILED" };
+    let (path, name) = (&row.path, row.name());
+    out!("{path:9} {:5} {:9.1e} {:9.1e} {verdict:7} {name}", row.cases, row.deviation, row.tolerance);
+    if !row.is_ok() {
+        out!("          in {}", row.seen_in);
+    }
+}
+
+fn print_end(report: &Report, seconds: f64) {
+    report.paths.iter().for_each(|path| out!("- {path}"));
     report.errors.iter().for_each(|failure| out!("FAILED  {}: {}", failure.part, failure.error));
     if !report.untested.is_empty() {
         out!("not tested: {}", report.untested.join(", "));

@@ -239,6 +239,8 @@ impl Gpu {
             .flags(shared.pipeline_flags())
             .stage(stage)
             .layout(pipeline.layout)];
+        // Before the call, so that a kernel on which a driver spends minutes can be named.
+        tracing::debug!("compiling {} for {local_size} invocations", code.name);
         // SAFETY: module and layout were just made; entries and values live until the call returns, and the entries lie
         // inside the values.
         let made = unsafe { device.create_compute_pipelines(shared.pipeline_cache, &create, None) };
