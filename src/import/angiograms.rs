@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::geometry::CArm;
-use crate::import::dicom::{Relationship, Run};
+use crate::import::dicom::{PixelRange, Relationship, Run};
 use crate::import::image_beat;
 use crate::import::stands::stands;
 use crate::raster::{Image, dilate, opening, percentile};
@@ -246,12 +246,14 @@ impl Chosen<'_> {
 
 /// Returns the conversion from a pixel value, brighter for less absorption, to a line integral.
 fn intensity(run: &Run) -> impl Fn(f32) -> f32 + use<> {
-    let (white, relationship) = (f64::from(run.white), run.relationship);
+    let PixelRange { black, low, white } = run.range;
+    let [black, low, white] = [black, low, white].map(f64::from);
+    let relationship = run.relationship;
     move |value: f32| {
         let v = f64::from(value);
         (match relationship {
-            Relationship::Linear => -((v / white).max(1e-4)).ln(),
-            Relationship::Log | Relationship::Display => (white - v) / white.max(1e-9) * DISPLAY_SPAN,
+            Relationship::Linear => -(((v - black) / (white - black)).max(1e-4)).ln(),
+            Relationship::Log | Relationship::Display => (white - v) / (white - low) * DISPLAY_SPAN,
         }) as f32
     }
 }
@@ -350,7 +352,7 @@ fn burnt_in_text(run: &Run) -> Vec<usize> {
     }
     let darkest = run.frames.iter().flatten().copied().fold(f32::MAX, f32::min);
     let fixed = |p: usize, value: f32| run.frames.iter().all(|f| f[p] == value);
-    (0..run.width * run.height).filter(|p| fixed(*p, run.white) || fixed(*p, darkest)).collect()
+    (0..run.width * run.height).filter(|p| fixed(*p, run.range.white) || fixed(*p, darkest)).collect()
 }
 
 fn without_text(frame: &[f32], width: usize, text: &[usize]) -> Vec<f32> {

@@ -5,8 +5,8 @@ use crate::fingerprint::Fingerprint;
 use crate::geometry::CArm;
 use crate::import::{ecg, lengths};
 use crate::scan::gating::RPeaks;
-use dicom_core::Tag;
 use dicom_core::header::HasLength;
+use dicom_core::{Tag, VR};
 use dicom_dictionary_std::tags;
 use dicom_object::{FileDicomObject, InMemDicomObject, OpenFileOptions};
 use dicom_pixeldata::{ConvertOptions, ModalityLutOption, PixelDecoder, VoiLutOption};
@@ -41,8 +41,8 @@ pub struct Run {
     pub height: usize,
     /// Frames in row-major order, with larger values for less absorption.
     pub frames: Vec<Vec<f32>>,
-    /// Largest possible pixel value.
-    pub white: f32,
+    /// Range of possible pixel values.
+    pub range: PixelRange,
     /// Meaning of the pixel values.
     pub relationship: Relationship,
     /// C-arm of each frame; table positions are as the file states them, not relative to another run.
@@ -154,8 +154,13 @@ impl Run {
         }
         let c_arms = r.c_arms(n, [width, height], pixel_mm, &mut notes)?;
         let times_s = r.times(n, &mut notes)?;
-        let relationship = r.relationship(&mut notes);
-        let (frames, white) = r.frames(n, width * height, &mut notes)?;
+        let table = r.modality_table()?;
+        let relationship = match table {
+            // Part 3, C.8.7.1.1.2: the table of an angiogram leads from stored values to values linear in intensity.
+            Some(_) => Relationship::Linear,
+            None => r.relationship(&mut notes),
+        };
+        let (frames, range) = r.frames(n, width * height, table.as_ref(), &mut notes)?;
         let r_peaks = r.r_peaks(&times_s, &mut notes);
         let hashed = |tag| Fingerprint::of(r.text(tag).unwrap_or_default().as_bytes()).value();
         let identity = [tags::PATIENT_ID, tags::STUDY_INSTANCE_UID].map(hashed);
@@ -165,7 +170,7 @@ impl Run {
             width,
             height,
             frames,
-            white,
+            range,
             relationship,
             c_arms,
             times_s,
@@ -320,8 +325,46 @@ impl Reader<'_> {
         }
     }
 
-    /// Decodes all frames, applies the modality LUT, and returns them with the largest possible value.
-    fn frames(&self, n: usize, pixels: usize, notes: &mut Vec<String>) -> Result<(Vec<Vec<f32>>, f32)> {
+    /// Reads the table of the Modality LUT Sequence.
+    fn modality_table(&self) -> Result<Option<ModalityTable>> {
+        let tag = tags::MODALITY_LUT_SEQUENCE;
+        let Some(sequence) = self.object.get(tag) else { return Ok(None) };
+        let bad = |problem: &str| self.bad(tag, "ModalityLUTSequence", problem);
+        let item = sequence.items().and_then(|items| items.first()).ok_or_else(|| bad("has no item"))?;
+        let descriptor = item.get(tags::LUT_DESCRIPTOR).and_then(|element| element.to_multi_float64().ok());
+        let Some(&[entries, first, _]) = descriptor.as_deref() else {
+            return Err(bad("its LUTDescriptor does not have three numbers"));
+        };
+        // Numbers of entries are stored in 16 bits, in which 65536 is 0; the first value has the sign of the pixels.
+        let entries = if entries == 0.0 { 1 << 16 } else { entries as usize };
+        let first = if self.is_signed()? && first > f64::from(i16::MAX) { first - 65536.0 } else { first };
+        let data = item.get(tags::LUT_DATA).ok_or_else(|| bad("has no LUTData"))?;
+        let values: Vec<f32> = match data.vr() {
+            VR::OW | VR::UN => {
+                let bytes = data.to_bytes().map_err(|e| bad(&e.to_string()))?;
+                bytes.chunks_exact(2).map(|word| f32::from(u16::from_le_bytes([word[0], word[1]]))).collect()
+            }
+            _ => data.to_multi_float32().map_err(|e| bad(&e.to_string()))?,
+        };
+        if values.len() < entries || entries < 2 {
+            return Err(bad(&format!("has {} values where its LUTDescriptor states {entries}", values.len())));
+        }
+        Ok(Some(ModalityTable { first, values: values[..entries].to_vec() }))
+    }
+
+    fn is_signed(&self) -> Result<bool> {
+        Ok(self.number(tags::PIXEL_REPRESENTATION, "PixelRepresentation")?.unwrap_or(0.0) != 0.0)
+    }
+
+    /// Decodes all frames, applies the modality LUT (a table, or slope and intercept), and returns them with the range of possible
+    /// values, which follows from the bits stored and from the LUT, not from the values of this run.
+    fn frames(
+        &self,
+        n: usize,
+        pixels: usize,
+        table: Option<&ModalityTable>,
+        notes: &mut Vec<String>,
+    ) -> Result<(Vec<Vec<f32>>, PixelRange)> {
         let tag = tags::PIXEL_DATA;
         if self.object.get(tag).is_none() {
             return Err(self.bad(tag, "PixelData", "is missing"));
@@ -334,19 +377,24 @@ impl Reader<'_> {
                 format!("{bits} is not in the accepted range, 1 to 16"),
             ));
         }
-        let signed = self.number(tags::PIXEL_REPRESENTATION, "PixelRepresentation")?.unwrap_or(0.0) != 0.0;
         let slope = self.number(tags::RESCALE_SLOPE, "RescaleSlope")?.unwrap_or(1.0);
         let intercept = self.number(tags::RESCALE_INTERCEPT, "RescaleIntercept")?.unwrap_or(0.0);
-        let has_table = self.object.get(tags::MODALITY_LUT_SEQUENCE).is_some();
-        if has_table || slope != 1.0 || intercept != 0.0 {
-            notes.push("the modality LUT was applied, but not the VOI LUT and the window".into());
+        let is_rescaled = slope != 1.0 || intercept != 0.0;
+        match table {
+            Some(_) => notes.push(
+                "the table of the modality LUT was applied, after which pixels are linear in intensity; the VOI LUT and the \
+                 window were not"
+                    .into(),
+            ),
+            None if is_rescaled => notes.push("the modality LUT was applied, but not the VOI LUT and the window".into()),
+            None => {}
         }
+        let modality = if table.is_some() { ModalityLutOption::None } else { ModalityLutOption::Default };
         // A decoder may panic on malformed data; the panic becomes an ordinary error of this file.
         let decode = |frame: usize| -> std::result::Result<Vec<f32>, String> {
             let decoded = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
-                let options = ConvertOptions::new()
-                    .with_modality_lut(ModalityLutOption::Default)
-                    .with_voi_lut(VoiLutOption::Identity);
+                let options =
+                    ConvertOptions::new().with_modality_lut(modality.clone()).with_voi_lut(VoiLutOption::Identity);
                 let frame = self.object.decode_pixel_data_frame(frame as u32).map_err(|e| describe(&e))?;
                 frame.to_vec_with_options::<f32>(&options).map_err(|e| describe(&e))
             }));
@@ -362,17 +410,30 @@ impl Reader<'_> {
                 }
             })
             .collect::<Result<Vec<Vec<f32>>>>()?;
-        let span = (2f64.powf(bits) - 1.0) as f32;
-        let (mut low, mut white) = if signed { (-(span + 1.0) / 2.0, (span - 1.0) / 2.0) } else { (0.0, span) };
-        if has_table || slope != 1.0 || intercept != 0.0 {
-            let all = || frames.iter().flatten().copied();
-            (low, white) = (all().fold(f32::MAX, f32::min), all().fold(f32::MIN, f32::max));
+        let signed = self.is_signed()?;
+        let span = 2f64.powf(bits) - 1.0;
+        let stored = if signed { [-(span + 1.0) / 2.0, (span - 1.0) / 2.0] } else { [0.0, span] };
+        let range = match table {
+            Some(table) => {
+                frames.iter_mut().flatten().for_each(|value| *value = table.value(*value));
+                PixelRange { black: 0.0, low: table.low(), white: table.high() }
+            }
+            None => {
+                let [a, b] = stored.map(|value| (slope * value + intercept) as f32);
+                // Rescaled values are intensities themselves; others may be stored with an offset, as signed numbers.
+                let (low, white) = (a.min(b), a.max(b));
+                PixelRange { black: if is_rescaled { 0.0 } else { low }, low, white }
+            }
+        };
+        if range.white <= range.low || range.white <= range.black {
+            let problem = format!("gives values from {} to {}, which are no intensities", range.low, range.white);
+            return Err(self.bad(tags::RESCALE_SLOPE, "the modality LUT", problem));
         }
         if self.text(tags::PHOTOMETRIC_INTERPRETATION).as_deref() == Some("MONOCHROME1") {
             notes.push("MONOCHROME1: the images were inverted, so that brighter pixels mean less absorption".into());
-            frames.iter_mut().flatten().for_each(|v| *v = low + white - *v);
+            frames.iter_mut().flatten().for_each(|v| *v = range.low + range.white - *v);
         }
-        Ok((frames, white))
+        Ok((frames, range))
     }
 
     /// Columns and rows inside the collimator's shutters.
@@ -450,6 +511,40 @@ impl Reader<'_> {
         };
         let length_s = times_s.last()? + times_s.get(1).copied().unwrap_or(0.0);
         Some(("CurveData", trace.clone(), trace.len() as f64 / length_s))
+    }
+}
+
+/// Range of possible pixel values of a run, after its modality LUT.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PixelRange {
+    /// Value of no intensity, for pixels that are linear in intensity.
+    pub black: f32,
+    /// Smallest value.
+    pub low: f32,
+    /// Largest value: no absorption.
+    pub white: f32,
+}
+
+/// Table of a modality LUT (Part 3, C.11.1).
+struct ModalityTable {
+    /// Stored value of the first entry.
+    first: f64,
+    /// Entries; the first and the last also stand for the stored values beyond them.
+    values: Vec<f32>,
+}
+
+impl ModalityTable {
+    fn value(&self, stored: f32) -> f32 {
+        let index = (f64::from(stored) - self.first).clamp(0.0, (self.values.len() - 1) as f64);
+        self.values[index as usize]
+    }
+
+    fn low(&self) -> f32 {
+        self.values.iter().copied().fold(f32::MAX, f32::min)
+    }
+
+    fn high(&self) -> f32 {
+        self.values.iter().copied().fold(f32::MIN, f32::max)
     }
 }
 

@@ -434,6 +434,62 @@ fn a_first_session_needs_no_manual() {
 }
 
 #[test]
+#[cfg(unix)]
+fn errors_of_standard_output_fail_and_closed_pipes_do_not() {
+    let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
+    for args in [&["info", "--schema"][..], &["completions", "bash"], &["train", "--print-config"]] {
+        let out = program().args(args).stdout(full.try_clone().unwrap()).output().unwrap();
+        let stderr = String::from_utf8_lossy(&out.stderr);
+        assert_eq!(out.status.code(), Some(1), "{args:?}: {stderr}");
+        assert!(stderr.contains("standard output") && stderr.contains("No space left"), "{stderr}");
+        let mut piped = program();
+        piped.args(args).stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped());
+        let mut child = piped.spawn().unwrap();
+        drop(child.stdout.take());
+        let out = child.wait_with_output().unwrap();
+        assert!(out.status.success() && out.stderr.is_empty(), "{args:?}: {}", String::from_utf8_lossy(&out.stderr));
+    }
+}
+
+#[test]
+#[cfg(unix)]
+fn the_umask_decides_who_may_read_files() {
+    use std::os::unix::fs::PermissionsExt;
+    let directory = tempfile::tempdir().unwrap();
+    for (umask, mode) in [("077", 0o600), ("002", 0o664), ("022", 0o644)] {
+        let mut shell = std::process::Command::new("sh");
+        let phantom = "umask $1; exec \"$2\" phantom $1 --size 16 --phases 3 --no-volumes";
+        shell.args(["-c", phantom, "sh", umask]).arg(program().get_program()).current_dir(&directory);
+        assert!(shell.output().unwrap().status.success(), "{umask}");
+        let meta = std::fs::metadata(directory.path().join(umask).join("dataset.json")).unwrap();
+        assert_eq!(meta.permissions().mode() & 0o777, mode, "{umask}");
+    }
+}
+
+#[test]
+fn two_trainings_do_not_mix_in_one_directory() {
+    let directory = tempfile::tempdir().unwrap();
+    let data = phantom(directory.path(), &[]);
+    let run = directory.path().join("run");
+    let train = ["train", text(&data), "-o", text(&run)];
+    let settings = [SHORT, &["--set", "train.iterations=100000", "--set", "train.validate_every=0"]].concat();
+    let mut first = program();
+    first.args([&train[..], &["--json"], &settings].concat()).stdout(std::process::Stdio::piped());
+    let mut first = first.spawn().unwrap();
+    // It has begun when it reports something.
+    let mut line = String::new();
+    let mut said = std::io::BufReader::new(first.stdout.take().unwrap());
+    std::io::BufRead::read_line(&mut said, &mut line).unwrap();
+    for more in [&["--force"][..], &["--resume"]] {
+        fails(&[&train[..], more].concat(), 75, &["another process trains", text(&run)]);
+    }
+    first.kill().unwrap();
+    first.wait().unwrap();
+    // The lock ends with its process.
+    ok(&[&train[..], &["--force", "--no-eval"], SHORT].concat());
+}
+
+#[test]
 fn the_committed_schema_is_current() {
     let committed = include_str!("../../docs/dataset.schema.json");
     assert_eq!(ok(&["info", "--schema"]), committed, "run: tools/bless");

@@ -5,6 +5,8 @@
 mod common;
 #[path = "../common/dicom.rs"]
 mod dicom;
+#[path = "../common/python.rs"]
+mod python;
 #[path = "../common/root.rs"]
 mod root;
 #[path = "../common/shared.rs"]
@@ -15,5 +17,8 @@ mod image_beat;
 #[cfg(feature = "dicom")]
 mod import_frames;
 mod malformed;
+#[cfg(feature = "dicom")]
+mod modality_luts;
 mod nerfca;
 mod real_data;
+mod units_and_spaces;

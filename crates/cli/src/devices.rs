@@ -74,6 +74,8 @@ pub fn run(args: &DevicesArgs) -> Result<()> {
 
 /// Prints shell completions for the program's command line.
 pub fn completions(args: &CompletionsArgs, program: &mut clap::Command) -> Result<()> {
-    clap_complete::generate(args.shell, program, "nertca-vk", &mut std::io::stdout());
+    let mut script = Vec::new();
+    clap_complete::generate(args.shell, program, "nertca-vk", &mut script);
+    out!("{}", String::from_utf8_lossy(&script).trim_end());
     Ok(())
 }

@@ -1,11 +1,10 @@
 //! The command line: arguments, progress, exit codes. It contains no algorithms.
 
-/// Prints a line to stdout. A closed stdout (as with `| head`) is not an error.
+/// Prints a line to stdout; see [`stdout::print_line`].
 macro_rules! out {
-    ($($text:tt)*) => {{
-        use std::io::Write as _;
-        let _ = writeln!(std::io::stdout(), $($text)*);
-    }};
+    ($($text:tt)*) => {
+        crate::stdout::print_line(format_args!($($text)*))
+    };
 }
 
 mod bench;
@@ -34,6 +33,7 @@ mod render;
 mod report;
 mod score_table;
 mod selftest;
+mod stdout;
 mod study;
 mod study_page;
 mod synthetic_args;
@@ -65,7 +65,7 @@ fn main() -> ExitCode {
         }))
         .without_time()
         .init();
-    match cli.run() {
+    match cli.run().and_then(|()| stdout::finish()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("nertca-vk: {error}");

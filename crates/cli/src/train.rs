@@ -10,7 +10,7 @@ use clap::error::ErrorKind;
 use nertca_vk::checkpoint::{self, newest_model};
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
-use nertca_vk::files;
+use nertca_vk::files::{self, Lock};
 use nertca_vk::formats::nrrd;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
@@ -98,6 +98,8 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     if let Some(file) = &args.export_hull {
         return export_hull(&config, &dataset, file);
     }
+    // A run that is to be resumed must exist.
+    let _lock = if args.resume && !run.exists() { None } else { Some(take_run(run)?) };
     prepare_directory(run, args)?;
     let cancel = stop_flag()?;
     let gpu = global.open_device()?;
@@ -166,6 +168,17 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
 
 fn write_scores(report: &Path, scores: &Evaluation) -> Result<()> {
     Ok(files::write_atomic(&report.join("evaluation.json"), files::pretty_json(scores)?.as_bytes())?)
+}
+
+/// Name of the file that the process holds which trains into a run directory.
+const LOCK: &str = "train.lock";
+
+/// Takes a run directory for this process, so that two trainings do not mix their files in it.
+fn take_run(run: &Path) -> Result<Lock> {
+    Lock::take(&run.join(LOCK))?.ok_or_else(|| {
+        let problem = "another process trains into this run directory: wait for it, or choose another --out";
+        Error::Busy(format!("{}: {problem}", run.display()))
+    })
 }
 
 fn prepare_directory(run: &Path, args: &TrainArgs) -> Result<()> {

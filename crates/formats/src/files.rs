@@ -40,21 +40,17 @@ pub fn write_atomic_by<E: From<Error>>(
         _ => Path::new("."),
     };
     create_directory(directory)?;
-    let temporary = tempfile::Builder::new()
-        .prefix(PARTIAL)
-        .tempfile_in(directory)
-        .map_err(Error::io("create a temporary file in", directory))?;
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(PARTIAL);
+    // Temporary files are private by default, but outputs are ordinary files, for which the umask decides.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let temporary = builder.tempfile_in(directory).map_err(Error::io("create a temporary file in", directory))?;
     hold(temporary.as_file());
     let mut writer = BufWriter::new(temporary.as_file());
     produce(&mut writer)?;
     writer.flush().map_err(Error::io("write", path))?;
     drop(writer);
-    #[cfg(unix)]
-    {
-        // Temporary files are private by default; outputs are ordinary files.
-        use std::os::unix::fs::PermissionsExt;
-        let _ = temporary.as_file().set_permissions(std::fs::Permissions::from_mode(0o644));
-    }
     temporary.as_file().sync_all().map_err(Error::io("flush", path))?;
     temporary.persist(path).map_err(|e| e.error).map_err(Error::io("rename into place", path))?;
     Ok(())

@@ -29,7 +29,11 @@ const DATA_AT: usize = 352;
 const DESCRIP_BYTES: usize = 79;
 const DT_FLOAT32: i16 = 16;
 const SCANNER_COORDINATES: i16 = 1;
+const UNITS_M: u8 = 1;
 const UNITS_MM: u8 = 2;
+const UNITS_MICROMETRES: u8 = 3;
+/// Bits of `xyzt_units` that state the unit of lengths.
+const UNITS_OF_LENGTH: u8 = 0b111;
 const UNITS_S: u8 = 8;
 
 /// A header under construction.
@@ -103,10 +107,27 @@ pub fn read(path: &Path) -> Result<Volume> {
             }
         }
     }
+    let mm_per_unit = mm_per_unit(header.xyzt_units).ok_or_else(|| {
+        let problem = format!(
+            "{} is no unit of length: 1 (m), 2 (mm), 3 (micrometres) and 0 (unknown, read as mm) are",
+            header.xyzt_units
+        );
+        bad("xyzt_units", problem)
+    })?;
     let ras = affine_of(&header).ok_or_else(|| bad("sform", "neither sform nor qform is set".into()))?;
-    let flip = DMat3::from_diagonal(DVec3::new(-1.0, -1.0, 1.0));
+    let flip = DMat3::from_diagonal(mm_per_unit * DVec3::new(-1.0, -1.0, 1.0));
     let index_to_lps = DAffine3::from_mat3_translation(flip * ras.matrix3, flip * ras.translation);
     Ok(Volume { size, values, index_to_lps })
+}
+
+/// Length of the unit that a header states, mm; files that state none have mm, as other readers assume.
+fn mm_per_unit(xyzt_units: u8) -> Option<f64> {
+    match xyzt_units & UNITS_OF_LENGTH {
+        0 | UNITS_MM => Some(1.0),
+        UNITS_M => Some(1e3),
+        UNITS_MICROMETRES => Some(1e-3),
+        _ => None,
+    }
 }
 
 fn affine_of(header: &nifti::NiftiHeader) -> Option<DAffine3> {

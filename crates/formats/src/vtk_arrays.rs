@@ -174,7 +174,7 @@ impl<'a> Arrays<'a> {
             "Int16" => read!(i16),
             "UInt16" => read!(u16),
             "Int8" => read!(i8),
-            "UInt8" => read!(u8),
+            "UInt8" | "String" => read!(u8),
             _ => None,
         }
     }

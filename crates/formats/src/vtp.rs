@@ -146,6 +146,15 @@ pub fn read(path: &Path) -> Result<ReadLines> {
     let (points, []) = points.as_chunks::<3>() else {
         return Err(Error::data(path, "Points", "do not have three numbers each"));
     };
+    let sign = match stated_space(data, &arrays)?.as_deref() {
+        None | Some("LPS") => 1.0,
+        Some("RAS") => -1.0,
+        Some(other) => {
+            let problem = format!("`{other}` is not supported: LPS and RAS are");
+            return Err(Error::data(path, "FieldData SPACE", problem));
+        }
+    };
+    let points: Vec<[f64; 3]> = points.iter().map(|[x, y, z]| [sign * x, sign * y, *z]).collect();
     let of_lines = |name: &str| -> Result<Vec<f64>> {
         let mut found = data_arrays(child(piece, "Lines")).filter(|array| array.attribute("Name") == Some(name));
         found.next().map_or(Ok(Vec::new()), |array| arrays.values(array))
@@ -167,7 +176,16 @@ pub fn read(path: &Path) -> Result<ReadLines> {
     }
     let lines = lines
         .ok_or_else(|| Error::data(path, "Lines", "refer to points that do not exist, or exceed their own list"))?;
-    Ok(ReadLines { points: points.to_vec(), lines, of_points })
+    Ok(ReadLines { points, lines, of_points })
+}
+
+/// Returns the space of the points, which 3D Slicer states in the field data: `LPS` or `RAS`; none where a file states nothing.
+fn stated_space(data: Option<Node<'_, '_>>, arrays: &Arrays<'_>) -> Result<Option<String>> {
+    let fields = data.and_then(|data| child(data, "FieldData")).into_iter().flat_map(|fields| fields.children());
+    let mut spaces = fields.filter(|array| array.attribute("Name") == Some("SPACE"));
+    let Some(space) = spaces.next() else { return Ok(None) };
+    let codes = arrays.values(space)?;
+    Ok(Some(codes.iter().map(|code| *code as u8 as char).take_while(|letter| *letter != '\0').collect()))
 }
 
 /// Splits the point indices of all lines (`connectivity`) at the end of each line (`ends`); none if an index or an end is out
