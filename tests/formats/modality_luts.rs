@@ -126,7 +126,7 @@ fn a_storage_form_does_not_change_linear_integrals() {
     let is_linear = |o: &mut InMemDicomObject| {
         o.put(DataElement::new(tags::PIXEL_INTENSITY_RELATIONSHIP, VR::CS, PrimitiveValue::from("LIN")));
     };
-    write(&file, 12, false, |v| i32::from(v), is_linear);
+    write(&file, 12, false, i32::from, is_linear);
     expect(&file, directory.path(), linear);
     write(&file, 12, true, |v| i32::from(v) - 2048, is_linear);
     expect(&file, directory.path(), linear);
@@ -150,30 +150,24 @@ fn the_table_of_a_modality_lut_leads_to_linear_intensity() {
     let entries = |of: &dyn Fn(f64) -> f64| (0..4096).map(|v| of(f64::from(v)).round() as u16).collect::<Vec<u16>>();
     let (identity, square) = (entries(&|v| v), entries(&|v| 65535.0 * (v / 4095.0).powi(2)));
     for vr in [VR::US, VR::OW] {
-        write(&file, 12, false, |v| i32::from(v), |o| table(o, 0, &identity, vr));
+        write(&file, 12, false, i32::from, |o| table(o, 0, &identity, vr));
         expect(&file, directory.path(), |v| -(v / 4095.0).ln());
-        write(&file, 12, false, |v| i32::from(v), |o| table(o, 0, &square, vr));
+        write(&file, 12, false, i32::from, |o| table(o, 0, &square, vr));
         expect(&file, directory.path(), |v| -2.0 * (v / 4095.0).ln());
     }
     // Values below the first entry have its value, and those beyond the last one the last value.
     let part: Vec<u16> = (0..1600).map(|i| 1500 + i).collect();
-    write(&file, 12, false, |v| i32::from(v), |o| table(o, 1500, &part, VR::US));
+    write(&file, 12, false, i32::from, |o| table(o, 1500, &part, VR::US));
     expect(&file, directory.path(), |v| -(v.clamp(1500.0, 3099.0) / 3099.0).ln());
     // A table that is shorter than it states is refused.
-    write(
-        &file,
-        12,
-        false,
-        |v| i32::from(v),
-        |o| {
-            table(o, 0, &identity, VR::US);
-            let mut item = InMemDicomObject::new_empty();
-            let numbers = |values: &[u16]| PrimitiveValue::U16(values.iter().copied().collect());
-            item.put(DataElement::new(tags::LUT_DESCRIPTOR, VR::US, numbers(&[4096, 0, 16])));
-            item.put(DataElement::new(tags::LUT_DATA, VR::US, numbers(&[1, 2, 3])));
-            o.put(DataElement::new(tags::MODALITY_LUT_SEQUENCE, VR::SQ, DataSetSequence::from(vec![item])));
-        },
-    );
+    write(&file, 12, false, i32::from, |o| {
+        table(o, 0, &identity, VR::US);
+        let mut item = InMemDicomObject::new_empty();
+        let numbers = |values: &[u16]| PrimitiveValue::U16(values.iter().copied().collect());
+        item.put(DataElement::new(tags::LUT_DESCRIPTOR, VR::US, numbers(&[4096, 0, 16])));
+        item.put(DataElement::new(tags::LUT_DATA, VR::US, numbers(&[1, 2, 3])));
+        o.put(DataElement::new(tags::MODALITY_LUT_SEQUENCE, VR::SQ, DataSetSequence::from(vec![item])));
+    });
     let error = Run::read(&file, None).err().unwrap().to_string();
     assert!(error.contains("ModalityLUTSequence") && error.contains("3 values"), "{error}");
 }
