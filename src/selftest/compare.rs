@@ -51,6 +51,14 @@ pub enum Tolerance {
 }
 
 impl Tolerance {
+    /// Returns the tolerance, or `min` of the same kind if that is larger.
+    pub fn at_least(self, min: f64) -> Tolerance {
+        match self {
+            Tolerance::OfLargest(max) => Tolerance::OfLargest(max.max(min)),
+            Tolerance::OfNorm(max) => Tolerance::OfNorm(max.max(min)),
+        }
+    }
+
     /// Returns the tolerance multiplied by a factor.
     pub fn times(self, factor: f64) -> Tolerance {
         match self {

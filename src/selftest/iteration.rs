@@ -130,7 +130,10 @@ pub(super) struct Tolerances {
     pub(super) loss: f64,
 }
 
-/// f32 sums of a few thousand terms; ReLU kinks are not crossed by rounding in these cases.
+/// Deviation of gradients where rounding puts a few inputs of ReLUs on the other side of zero: the gradient of such a neuron gains or
+/// loses a sample, and so do the layers below. SwiftShader, whose attenuations deviate by 6e-6, reaches 2.7e-3.
+const CROSSED_KINKS: f64 = 5e-3;
+/// f32 sums of a few thousand terms; ReLU kinks are not crossed by the rounding of llvmpipe in these cases.
 const IN_F32: Tolerances = Tolerances { sigma: F32_SUMS, gradient: F32_SUMS, loss: 2e-5 };
 /// Numbers that are sums in f32.
 pub(super) const F32_SUMS: Tolerance = Tolerance::OfLargest(1e-4);
@@ -327,15 +330,17 @@ impl Tolerances {
         };
         let sine = sine_factor(info);
         let Tolerances { sigma, gradient, loss } = exact;
-        Tolerances { sigma: sigma.times(sine), gradient: gradient.times(sine), loss: loss * sine }
+        let gradient = gradient.times(sine);
+        // The kinks of the cases are known to stay uncrossed by the rounding of llvmpipe only.
+        let gradient = if info.is_llvmpipe { gradient } else { gradient.at_least(CROSSED_KINKS) };
+        Tolerances { sigma: sigma.times(sine), gradient, loss: loss * sine }
     }
 }
 
-/// Factor on the network's tolerances on a device. Vulkan allows sine and cosine an error of 2^-11, which llvmpipe stays far below.
-/// SwiftShader uses it up: its gradients deviate by up to 2.7e-3, where 1e-4 are tolerated without the factor.
+/// Factor on the network's tolerances on a device. Vulkan allows sine and cosine an error of 2^-11, which CPU drivers stay far
+/// below. Faults are far larger than that.
 pub fn sine_factor(info: &DeviceInfo) -> f64 {
-    const OF_ALLOWED_ERROR: f64 = 50.0;
-    if info.is_llvmpipe { 1.0 } else { OF_ALLOWED_ERROR }
+    if info.is_cpu() { 1.0 } else { 10.0 }
 }
 
 impl Twin<'_> {
