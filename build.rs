@@ -26,6 +26,7 @@ fn main() -> Result<(), Failure> {
     println!("cargo:rerun-if-changed=build");
     println!("cargo:rerun-if-changed=glsl");
     println!("cargo:rerun-if-env-changed=SHADERC_LIB_DIR");
+    println!("cargo:rerun-if-env-changed={}", compile::WITHOUT_MATRICES);
     if let Some(directory) = env::var_os("SHADERC_LIB_DIR") {
         println!("cargo:rerun-if-changed={}", Path::new(&directory).join("libshaderc_combined.a").display());
     }
