@@ -11,19 +11,19 @@ fn nertca(args: &[&str]) -> Output {
     program().args(args).output().unwrap()
 }
 
-fn text(path: &Path) -> &str {
+pub fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
 /// Runs with the validation layers on (messages make the program fail) and returns stdout.
-fn ok(args: &[&str]) -> String {
+pub fn ok(args: &[&str]) -> String {
     let out = nertca(&[&["--validate"], args].concat());
     assert!(out.status.success(), "{args:?}: {}", String::from_utf8_lossy(&out.stderr));
     String::from_utf8(out.stdout).unwrap()
 }
 
 /// Expects exit code `code` and an error on stderr that names all `parts`, without a panic.
-fn fails(args: &[&str], code: i32, parts: &[&str]) {
+pub fn fails(args: &[&str], code: i32, parts: &[&str]) {
     let out = nertca(args);
     let stderr = String::from_utf8_lossy(&out.stderr);
     assert_eq!(out.status.code(), Some(code), "{args:?}: {stderr}");
@@ -33,13 +33,13 @@ fn fails(args: &[&str], code: i32, parts: &[&str]) {
     }
 }
 
-fn phantom(directory: &Path, extra: &[&str]) -> PathBuf {
+pub fn phantom(directory: &Path, extra: &[&str]) -> PathBuf {
     let out = directory.join("phantom with spaces é");
     ok(&[&["phantom", text(&out), "--size", "24", "--phases", "3", "--views", "3", "--no-volumes"], extra].concat());
     out
 }
 
-const SHORT: &[&str] = &[
+pub const SHORT: &[&str] = &[
     "--set",
     "train.iterations=30",
     "--set",
@@ -400,93 +400,6 @@ fn usage_errors_have_their_exit_codes() {
     assert!(details["int64"].is_boolean() && details["buffer_int64_atomics"].is_boolean(), "{details}");
     assert!(names("queues").contains("compute") && names("queues").contains("timestamp_bits"), "{details}");
     assert!(names("extensions").contains("VK_KHR_") && names("heaps").contains("device_local"), "{details}");
-}
-
-#[test]
-fn a_first_session_needs_no_manual() {
-    let directory = tempfile::tempdir().unwrap();
-    let shown = |args: &[&str]| {
-        let out = program().args(args).current_dir(&directory).output().unwrap();
-        let said = [out.stdout, out.stderr].map(|bytes| String::from_utf8(bytes).unwrap());
-        (out.status.code(), said.concat())
-    };
-    let (code, help) = shown(&[]);
-    assert_eq!(code, Some(2));
-    assert_eq!(shown(&["--help"]), (Some(0), help.clone()));
-    assert!(help.starts_with("4D reconstruction") && shown(&["--version"]).1.starts_with("nertca-vk "), "{help}");
-    // The first steps are those that follow, in a smaller size.
-    let steps = help.split("First steps:").nth(1).unwrap();
-    for step in ["nertca-vk phantom heart ", "nertca-vk train heart ", "nertca-vk view heart-run "] {
-        assert!(steps.contains(step), "{steps}");
-    }
-    assert_eq!(shown(&["phantom", "heart", "--size", "32", "--phases", "3"]).0, Some(0));
-    let settings =
-        ["--set", "train.iterations=12", "--set", "gaussians.iterations=10", "--set", "march.render_samples=24"];
-    let (code, said) = shown(&[&["train", "heart"], &settings[..]].concat());
-    assert_eq!(code, Some(0), "{said}");
-    let last: Vec<&str> =
-        said.lines().filter(|line| line.starts_with("report: ") || line.starts_with("next: ")).collect();
-    assert_eq!(last.len(), 2, "{said}");
-    assert!(last[0].ends_with("heart-run/report.html") && last[1].starts_with("next: nertca-vk view \"heart-run\""));
-    assert!(said.contains("Dice") && directory.path().join("heart-run/report.html").is_file(), "{said}");
-    // A second run does not replace the first.
-    assert_eq!(shown(&["train", "heart"]).0, Some(2));
-}
-
-#[test]
-#[cfg(unix)]
-fn errors_of_standard_output_fail_and_closed_pipes_do_not() {
-    let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
-    for args in [&["info", "--schema"][..], &["completions", "bash"], &["train", "--print-config"]] {
-        let out = program().args(args).stdout(full.try_clone().unwrap()).output().unwrap();
-        let stderr = String::from_utf8_lossy(&out.stderr);
-        assert_eq!(out.status.code(), Some(1), "{args:?}: {stderr}");
-        assert!(stderr.contains("standard output") && stderr.contains("No space left"), "{stderr}");
-        let mut piped = program();
-        piped.args(args).stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped());
-        let mut child = piped.spawn().unwrap();
-        drop(child.stdout.take());
-        let out = child.wait_with_output().unwrap();
-        assert!(out.status.success() && out.stderr.is_empty(), "{args:?}: {}", String::from_utf8_lossy(&out.stderr));
-    }
-}
-
-#[test]
-#[cfg(unix)]
-fn the_umask_decides_who_may_read_files() {
-    use std::os::unix::fs::PermissionsExt;
-    let directory = tempfile::tempdir().unwrap();
-    for (umask, mode) in [("077", 0o600), ("002", 0o664), ("022", 0o644)] {
-        let mut shell = std::process::Command::new("sh");
-        let phantom = "umask $1; exec \"$2\" phantom $1 --size 16 --phases 3 --no-volumes";
-        shell.args(["-c", phantom, "sh", umask]).arg(program().get_program()).current_dir(&directory);
-        assert!(shell.output().unwrap().status.success(), "{umask}");
-        let meta = std::fs::metadata(directory.path().join(umask).join("dataset.json")).unwrap();
-        assert_eq!(meta.permissions().mode() & 0o777, mode, "{umask}");
-    }
-}
-
-#[test]
-fn two_trainings_do_not_mix_in_one_directory() {
-    let directory = tempfile::tempdir().unwrap();
-    let data = phantom(directory.path(), &[]);
-    let run = directory.path().join("run");
-    let train = ["train", text(&data), "-o", text(&run)];
-    let settings = [SHORT, &["--set", "train.iterations=100000", "--set", "train.validate_every=0"]].concat();
-    let mut first = program();
-    first.args([&train[..], &["--json"], &settings].concat()).stdout(std::process::Stdio::piped());
-    let mut first = first.spawn().unwrap();
-    // It has begun when it reports something.
-    let mut line = String::new();
-    let mut said = std::io::BufReader::new(first.stdout.take().unwrap());
-    std::io::BufRead::read_line(&mut said, &mut line).unwrap();
-    for more in [&["--force"][..], &["--resume"]] {
-        fails(&[&train[..], more].concat(), 75, &["another process trains", text(&run)]);
-    }
-    first.kill().unwrap();
-    first.wait().unwrap();
-    // The lock ends with its process.
-    ok(&[&train[..], &["--force", "--no-eval"], SHORT].concat());
 }
 
 #[test]

@@ -25,6 +25,7 @@ mod calibrated_scores;
 mod campaign;
 mod capi_truth;
 mod dicom_export;
+mod first_session;
 mod gaussian_runs;
 mod imperfect_angiograms;
 mod inflow;
