@@ -1,4 +1,4 @@
-//! What a first session needs: help, defaults, directories, files and streams that behave as users expect.
+//! A first session: help, defaults, directories, files and streams that behave as users expect.
 
 use crate::interfaces::{SHORT, fails, ok, phantom, text};
 use crate::program::program;
