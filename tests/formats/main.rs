@@ -5,6 +5,8 @@
 mod common;
 #[path = "../common/dicom.rs"]
 mod dicom;
+#[path = "../common/parsers.rs"]
+mod parsers;
 #[path = "../common/python.rs"]
 mod python;
 #[path = "../common/root.rs"]

@@ -2,21 +2,9 @@
 //! parser does not terminate, neither does this test. `NERTCA_MALFORMED_INPUTS` sets the number of inputs for each parser;
 //! a failure names its seed, and `NERTCA_MALFORMED_SEED` repeats it.
 
-use crate::common;
-use crate::dicom;
-use glam::DVec3;
-use nertca_vk::checkpoint::Checkpoint;
-use nertca_vk::formats::images;
-use nertca_vk::formats::npy;
-use nertca_vk::formats::volume::{Volume, VolumeHints};
-use nertca_vk::formats::volume_files;
-use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use crate::parsers::{MAX_ALLOCATION_BYTES, PARSERS, Parser, scratch};
 use nertca_vk::import::ecg;
-use nertca_vk::plan::Plan;
-use nertca_vk::scan::dataset::Dataset;
-use nertca_vk::train::trainer::Trainer;
 use std::alloc::{GlobalAlloc, Layout, System};
-use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
@@ -24,6 +12,9 @@ use std::sync::{Mutex, PoisonError};
 struct Bounded;
 
 static LARGEST: AtomicUsize = AtomicUsize::new(0);
+
+/// Held by the parser that runs, because the largest allocation is recorded for all of them.
+static ALONE: Mutex<()> = Mutex::new(());
 
 // SAFETY: hands everything on to the system's allocator.
 unsafe impl GlobalAlloc for Bounded {
@@ -33,8 +24,8 @@ unsafe impl GlobalAlloc for Bounded {
         unsafe { System.alloc(layout) }
     }
 
-    // Zeroed memory costs nothing until it is written, and is then counted by `alloc` or `realloc`.
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
         // SAFETY: as the caller vouches.
         unsafe { System.alloc_zeroed(layout) }
     }
@@ -122,22 +113,17 @@ fn damage(seed: &[u8], random: &mut Random) -> Vec<u8> {
     bytes
 }
 
-fn scratch() -> tempfile::TempDir {
-    // A memory file system is faster than a disk for a million small files.
-    tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap()
-}
-
-/// Passes damaged copies of the seeds, as a file called `name`, to a parser.
-fn feed(name: &str, seeds: &[Vec<u8>], parse: impl Fn(&Path) -> bool) {
-    // Only one parser runs at a time, because the largest allocation is recorded for all of them.
-    static ALONE: Mutex<()> = Mutex::new(());
+/// Passes damaged copies of its seeds to a parser.
+fn feed(parser: &Parser) {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let Parser { name, file, parse, .. } = parser;
+    let seeds = (parser.seeds)();
     let number = |variable| std::env::var(variable).ok().map(|n| n.parse::<u64>().unwrap());
     let count = number("NERTCA_MALFORMED_INPUTS").unwrap_or(3000);
     let only = number("NERTCA_MALFORMED_SEED");
     let dir = scratch();
-    let path = dir.path().join(name);
-    for seed in seeds {
+    let path = dir.path().join(file);
+    for seed in &seeds {
         std::fs::write(&path, seed).unwrap();
         assert!(parse(&path), "{name}: the undamaged file is refused");
     }
@@ -148,13 +134,13 @@ fn feed(name: &str, seeds: &[Vec<u8>], parse: impl Fn(&Path) -> bool) {
         let bytes = damage(&seeds[which], &mut random);
         std::fs::write(&path, &bytes).unwrap();
         LARGEST.store(0, Ordering::Relaxed);
-        match std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| parse(&path))) {
+        match std::panic::catch_unwind(|| parse(&path)) {
             Ok(fine) => accepted += u64::from(fine),
-            Err(_) => panic!("{name}: input {input} made it panic: {}", keep(name, &bytes)),
+            Err(_) => panic!("{name}: input {input} made it panic: {}", keep(file, &bytes)),
         }
         let largest = LARGEST.load(Ordering::Relaxed);
-        if largest >= 512 << 20 {
-            panic!("{name}: input {input} asked for {largest} bytes: {}", keep(name, &bytes));
+        if largest >= MAX_ALLOCATION_BYTES {
+            panic!("{name}: input {input} asked for {largest} bytes: {}", keep(file, &bytes));
         }
     }
     println!("{name}: {count} inputs, {accepted} of them still good");
@@ -162,110 +148,63 @@ fn feed(name: &str, seeds: &[Vec<u8>], parse: impl Fn(&Path) -> bool) {
 }
 
 /// Keeps an input for inspection, and returns its path.
-fn keep(name: &str, bytes: &[u8]) -> String {
-    let path = std::env::temp_dir().join(format!("malformed-{name}"));
+fn keep(file: &str, bytes: &[u8]) -> String {
+    let path = std::env::temp_dir().join(format!("malformed-{file}"));
     std::fs::write(&path, bytes).unwrap();
     path.display().to_string()
 }
 
-/// A header followed by 60 values.
-fn volume_file(header: &str) -> Vec<u8> {
-    let values = (0..60u16).flat_map(|i| f32::from(i).to_le_bytes());
-    header.bytes().chain(values).collect()
-}
-
-fn reads_volume(path: &Path) -> bool {
-    let hints = VolumeHints { spacing_mm: Some([1.0; 3]), ..VolumeHints::default() };
-    volume_files::read(path, &hints).is_ok()
-}
-
 #[test]
-fn nrrd() {
-    let plain = "NRRD0004\ntype: float\ndimension: 3\nspace: left-posterior-superior\nsizes: 3 4 5\n\
-                 space directions: (1,0,0) (0,2,0) (0,0,3)\nendian: little\nencoding: raw\nspace origin: (1,2,3)\n\n";
+fn damaged_files_are_values_or_errors() {
+    PARSERS.iter().for_each(feed);
+}
+
+/// An input that the fuzzer found: parsing it took a time that doubled with each bracket.
+#[test]
+fn nested_brackets_are_refused_at_once() {
+    let header = format!("{{'descr': {}", "[".repeat(100));
+    let length = (header.len() as u16).to_le_bytes();
     let dir = scratch();
-    let zipped = dir.path().join("z.nrrd");
-    let half = Volume::centred([3, 4, 5], 1.0, DVec3::ZERO, vec![0.5; 60]);
-    nertca_vk::formats::nrrd::write(&zipped, &half, "halves").unwrap();
-    feed("v.nrrd", &[volume_file(plain), std::fs::read(&zipped).unwrap()], reads_volume);
+    let path = dir.path().join("nested.npy");
+    std::fs::write(&path, [b"\x93NUMPY\x01\0".as_slice(), &length, header.as_bytes()].concat()).unwrap();
+    let error = nertca_vk::formats::npy::read(&path, 1 << 20).unwrap_err().to_string();
+    assert!(error.contains("nested brackets"), "{error}");
 }
 
+/// Inputs that the fuzzer found: each once cost far more memory than it has bytes.
 #[test]
-fn metaimage() {
-    let header = "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\n\
-                  TransformMatrix = 1 0 0 0 1 0 0 0 1\nOffset = 0 0 0\nElementSpacing = 1 1 2\nDimSize = 3 4 5\n\
-                  ElementType = MET_FLOAT\nElementDataFile = LOCAL\n";
-    feed("v.mha", &[volume_file(header)], reads_volume);
-}
-
-#[test]
-fn npy_volumes_and_images() {
+fn sizes_that_files_only_claim_reserve_no_memory() {
+    const NIFTI_DIM_AT: usize = 40;
+    const NIFTI_DATATYPE_AT: usize = 70;
+    const COMPLEX_256: i16 = 2048;
+    let parser = |name: &str| PARSERS.iter().find(|parser| parser.name == name).unwrap();
+    let claimed_header = [b"\x93NUMPY\x02\0".as_slice(), &600_000_000u32.to_le_bytes(), b"{}"].concat();
+    let mut without_values = (parser("nifti").seeds)().remove(0);
+    let sizes = [3i16, 3, 16_000, 16_000].into_iter().enumerate();
+    let shorts = sizes.map(|(axis, length)| (NIFTI_DIM_AT + 2 * axis, length));
+    let no_bits = [(NIFTI_DATATYPE_AT, COMPLEX_256), (NIFTI_DATATYPE_AT + 2, 0)];
+    for (at, value) in shorts.chain(no_bits) {
+        without_values[at..][..2].copy_from_slice(&value.to_le_bytes());
+    }
     let dir = scratch();
-    let (cube, square) = (dir.path().join("c.npy"), dir.path().join("s.npy"));
-    npy::write(&cube, &[3, 4, 5], &[0.5; 60]).unwrap();
-    npy::write(&square, &[6, 10], &[0.5; 60]).unwrap();
-    feed("v.npy", &[std::fs::read(&cube).unwrap()], reads_volume);
-    feed("i.npy", &[std::fs::read(&square).unwrap()], |p| images::read_image(p).is_ok());
-}
-
-/// Writes a small dataset.
-fn dataset(layout: nertca_vk::scan::dataset::Layout) -> (tempfile::TempDir, PathBuf) {
-    let dir = scratch();
-    let out = dir.path().join("data");
-    nertca_vk::scan::writer::convert(&common::small_dataset(8, 8), layout, &out).unwrap();
-    (dir, out)
-}
-
-fn feed_dataset(layout: nertca_vk::scan::dataset::Layout, manifest: &str) {
-    let (_dir, out) = dataset(layout);
-    let seed = std::fs::read(out.join(manifest)).unwrap();
-    feed(manifest, &[seed], |path| {
-        std::fs::copy(path, out.join(manifest)).unwrap();
-        Dataset::open(&out).is_ok()
-    });
-}
-
-#[test]
-fn manifests() {
-    feed_dataset(nertca_vk::scan::dataset::Layout::Native, "dataset.json");
-}
-
-#[test]
-fn the_authors_geometry() {
-    feed_dataset(nertca_vk::scan::dataset::Layout::Nerfca, "general.json");
-}
-
-#[test]
-fn the_authors_frames() {
-    feed_dataset(nertca_vk::scan::dataset::Layout::Nerfca, "train-0.json");
-}
-
-#[test]
-fn checkpoints() {
-    let data = common::small_dataset(8, 8);
-    let config = common::small_config(
-        "fast-mlp",
-        &["static.grid=3", "dynamic.width=16", "dynamic.layers=2", "occupancy.enabled=false"],
-    );
-    let gpu = Gpu::open(&DeviceOptions::default()).unwrap();
-    let plan = Plan::new(&config, &data).unwrap();
-    let seed = Trainer::new(&gpu, plan, &data, common::tuning(&gpu)).unwrap().checkpoint().unwrap().to_bytes().unwrap();
-    feed("c.safetensors", &[seed], |p| Checkpoint::read(p).is_ok());
-}
-
-#[test]
-fn angiograms() {
-    let dir = scratch();
-    let file = dir.path().join("a.dcm");
-    dicom::angiogram(&file, |_| ());
-    feed("a.dcm", &[std::fs::read(&file).unwrap()], |p| nertca_vk::import::dicom::Run::read(p, None).is_ok());
+    for (name, bytes) in [("npy", claimed_header), ("nifti", without_values)] {
+        let Parser { file, parse, .. } = parser(name);
+        let path = dir.path().join(file);
+        std::fs::write(&path, bytes).unwrap();
+        let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+        LARGEST.store(0, Ordering::Relaxed);
+        assert!(!parse(&path), "{name}: accepted");
+        let largest = LARGEST.load(Ordering::Relaxed);
+        assert!(largest < MAX_ALLOCATION_BYTES, "{name}: asked for {largest} bytes");
+    }
 }
 
 #[test]
 fn ecg_traces() {
-    let seed: Vec<u8> = (0..400).map(|i| if i % 80 < 3 { 250 } else { (i % 7) as u8 }).collect();
-    feed("ecg", &[seed], |path| {
+    let seeds = || vec![(0..400).map(|i| if i % 80 < 3 { 250 } else { (i % 7) as u8 }).collect()];
+    let parse = |path: &std::path::Path| {
         let trace: Vec<f64> = std::fs::read(path).unwrap().iter().map(|b| f64::from(*b)).collect();
         ecg::r_peaks(&trace, 100.0).is_ok()
-    });
+    };
+    feed(&Parser { name: "ecg", file: "ecg", seeds, parse });
 }

@@ -97,7 +97,8 @@ pub fn read(path: &Path) -> Result<Volume> {
     if volume.dim().len() != axes {
         return Err(bad("dim", format!("{:?} does not agree with the header", volume.dim())));
     }
-    let mut values = Vec::with_capacity(size.iter().product());
+    // Nothing is reserved: a header can state a size and no bits per value, so that the file is complete without values.
+    let mut values = Vec::new();
     let mut index = vec![0u16; axes];
     for z in 0..header.dim[3] {
         for y in 0..header.dim[2] {

@@ -5,6 +5,9 @@ use crate::files;
 use std::io::Write;
 use std::path::Path;
 
+/// Largest header that is read: the largest of version 1, which arrays of numbers have.
+const MAX_HEADER_BYTES: usize = 1 << 16;
+
 /// A numeric array of any shape, in C order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Array {
@@ -21,7 +24,8 @@ pub struct Array {
 pub fn read(path: &Path, limit: u64) -> Result<Array> {
     let bytes = files::read_limited(path, limit)?;
     let bad = |problem: String| Error::data(path, "npy", problem);
-    check_shape(&bytes).map_err(|shape| bad(format!("the shape is too large ({shape})")))?;
+    let header = header(&bytes).map_err(bad)?;
+    check_nesting(header).and_then(|()| check_shape(header)).map_err(bad)?;
     let npy = npyz::NpyFile::new(&bytes[..]).map_err(|e| bad(format!("header: {e}")))?;
     let mut shape = Vec::new();
     let mut elements: u64 = 1;
@@ -70,14 +74,52 @@ pub fn read(path: &Path, limit: u64) -> Result<Array> {
     Ok(Array { shape, values })
 }
 
+/// Returns the header of a file, which the library must not see before it is checked: it reserves memory for any length that a file
+/// states.
+fn header(bytes: &[u8]) -> std::result::Result<&[u8], String> {
+    const VERSION_AT: usize = 6;
+    const LENGTH_AT: usize = 8;
+    let narrow = |at: &[u8]| at.first_chunk().map(|length| (usize::from(u16::from_le_bytes(*length)), LENGTH_AT + 2));
+    let wide = |at: &[u8]| at.first_chunk().map(|length| (u32::from_le_bytes(*length) as usize, LENGTH_AT + 4));
+    let version = bytes.get(VERSION_AT).copied().unwrap_or_default();
+    let stated = bytes.get(LENGTH_AT..).and_then(|at| if version < 2 { narrow(at) } else { wide(at) });
+    let (length, begin) = stated.ok_or("the file ends within its header")?;
+    if length > MAX_HEADER_BYTES {
+        return Err(format!(
+            "the header claims {length} bytes, but that of an array of numbers has {MAX_HEADER_BYTES} at most"
+        ));
+    }
+    bytes.get(begin..begin + length).ok_or_else(|| {
+        format!("the header claims {length} bytes, but the file has {} in all; it may be truncated", bytes.len())
+    })
+}
+
+/// Checks how deeply brackets in a header are nested: the library's parser needs a time that doubles with each level.
+fn check_nesting(header: &[u8]) -> std::result::Result<(), String> {
+    // A dictionary with a list of fields, each a tuple with a shape.
+    const MAX_DEPTH: usize = 4;
+    let mut depth = 0usize;
+    for byte in header {
+        match byte {
+            b'{' | b'[' | b'(' => depth += 1,
+            b'}' | b']' | b')' => depth = depth.saturating_sub(1),
+            _ => {}
+        }
+        if depth > MAX_DEPTH {
+            return Err("the header has too many nested brackets for an array of numbers".to_owned());
+        }
+    }
+    Ok(())
+}
+
 /// Checks the shape in a header for overflow; the library multiplies its axes without a check.
-fn check_shape(bytes: &[u8]) -> std::result::Result<(), String> {
-    let header = String::from_utf8_lossy(&bytes[..bytes.len().min(1 << 16)]);
+fn check_shape(header: &[u8]) -> std::result::Result<(), String> {
+    let header = String::from_utf8_lossy(header).replace('"', "'");
     let Some((_, rest)) = header.split_once("'shape'") else { return Ok(()) };
     let shape = rest.split_once('(').and_then(|(_, r)| r.split_once(')')).map_or("", |(s, _)| s);
     let axes = shape.split(',').map(str::trim).filter(|axis| !axis.is_empty());
     let elements = axes.map(|axis| axis.parse::<u64>().ok()).try_fold(1u64, |n, axis| n.checked_mul(axis?));
-    elements.map(drop).ok_or_else(|| shape.to_owned())
+    elements.map(drop).ok_or_else(|| format!("the shape is too large ({shape})"))
 }
 
 fn fortran_to_c(shape: &[usize], values: &[f32]) -> Vec<f32> {

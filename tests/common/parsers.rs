@@ -1,0 +1,208 @@
+//! Parsers of files that other programs make, each with files that it reads: input of the tests of damaged files and of the fuzzer.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "shared by tests")]
+
+use crate::common;
+use glam::DVec3;
+use nertca_vk::checkpoint::Checkpoint;
+use nertca_vk::formats::volume::{Volume, VolumeHeader, VolumeHints};
+use nertca_vk::formats::vtp::{Lines, Values};
+use nertca_vk::formats::{images, metaimage, nifti, npy, nrrd, png, volume_files};
+use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use nertca_vk::phantom::tree_file::TreeFile;
+use nertca_vk::plan::Plan;
+use nertca_vk::scan::dataset::{Dataset, Layout};
+use nertca_vk::train::trainer::Trainer;
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+/// Largest single allocation, in bytes, that a damaged file of a few kilobytes may cause.
+pub const MAX_ALLOCATION_BYTES: usize = 512 << 20;
+
+/// A parser with files that it accepts.
+pub struct Parser {
+    pub name: &'static str,
+    /// Name of the file that is parsed: some parsers go by it.
+    pub file: &'static str,
+    pub seeds: fn() -> Vec<Vec<u8>>,
+    /// Parses a file, and tells whether it was accepted.
+    pub parse: fn(&Path) -> bool,
+}
+
+pub const PARSERS: &[Parser] = &[
+    Parser { name: "nrrd", file: "v.nrrd", seeds: nrrd_files, parse: reads_volume },
+    Parser { name: "metaimage", file: "v.mha", seeds: metaimage_files, parse: reads_volume },
+    Parser { name: "nifti", file: "v.nii", seeds: nifti_files, parse: reads_volume },
+    Parser { name: "npy", file: "v.npy", seeds: npy_volumes, parse: reads_volume },
+    Parser { name: "npy_image", file: "i.npy", seeds: npy_images, parse: reads_image },
+    Parser { name: "png", file: "i.png", seeds: png_images, parse: reads_image },
+    Parser { name: "vtp", file: "t.vtp", seeds: vtp_trees, parse: reads_tree },
+    Parser { name: "tree_json", file: "t.json", seeds: json_trees, parse: reads_tree },
+    Parser { name: "manifest", file: "dataset.json", seeds: || vec![manifest(&NATIVE)], parse: |p| opens(&NATIVE, p) },
+    Parser {
+        name: "nerfca_geometry",
+        file: "general.json",
+        seeds: || vec![manifest(&GEOMETRY)],
+        parse: |p| opens(&GEOMETRY, p),
+    },
+    Parser {
+        name: "nerfca_frames",
+        file: "train-0.json",
+        seeds: || vec![manifest(&FRAMES)],
+        parse: |p| opens(&FRAMES, p),
+    },
+    Parser { name: "checkpoint", file: "c.safetensors", seeds: checkpoints, parse: |p| Checkpoint::read(p).is_ok() },
+    #[cfg(feature = "dicom")]
+    Parser {
+        name: "dicom",
+        file: "a.dcm",
+        seeds: angiograms,
+        parse: |p| nertca_vk::import::dicom::Run::read(p, None).is_ok(),
+    },
+];
+
+pub fn scratch() -> tempfile::TempDir {
+    // A memory file system is faster than a disk for a million small files.
+    tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap()
+}
+
+/// Returns the bytes of a file that `write` makes.
+fn written(file: &str, write: impl FnOnce(&Path)) -> Vec<u8> {
+    let directory = scratch();
+    let path = directory.path().join(file);
+    write(&path);
+    std::fs::read(path).unwrap()
+}
+
+/// A header followed by 60 values.
+fn volume_file(header: &[u8]) -> Vec<u8> {
+    let values = (0..60u16).flat_map(|i| f32::from(i).to_le_bytes());
+    header.iter().copied().chain(values).collect()
+}
+
+fn halves() -> Volume {
+    Volume::centred([3, 4, 5], 1.0, DVec3::ZERO, vec![0.5; 60])
+}
+
+fn reads_volume(path: &Path) -> bool {
+    let hints = VolumeHints { spacing_mm: Some([1.0; 3]), ..VolumeHints::default() };
+    volume_files::read(path, &hints).is_ok()
+}
+
+fn reads_image(path: &Path) -> bool {
+    images::read_image(path).is_ok()
+}
+
+fn nrrd_files() -> Vec<Vec<u8>> {
+    let plain = "NRRD0004\ntype: float\ndimension: 3\nspace: left-posterior-superior\nsizes: 3 4 5\n\
+                 space directions: (1,0,0) (0,2,0) (0,0,3)\nendian: little\nencoding: raw\nspace origin: (1,2,3)\n\n";
+    vec![volume_file(plain.as_bytes()), written("z.nrrd", |p| nrrd::write(p, &halves(), "halves").unwrap())]
+}
+
+/// Header of 3 x 4 x 5 values, as exports write it.
+fn exported() -> VolumeHeader {
+    VolumeHeader {
+        origin_mm: DVec3::new(1.0, 2.0, 3.0),
+        spacing_mm: DVec3::new(1.0, 2.0, 3.0),
+        size: [3, 4, 5],
+        phases: None,
+        quantity: "attenuation".into(),
+    }
+}
+
+fn metaimage_files() -> Vec<Vec<u8>> {
+    let header = "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\n\
+                  TransformMatrix = 1 0 0 0 1 0 0 0 1\nOffset = 0 0 0\nElementSpacing = 1 1 2\nDimSize = 3 4 5\n\
+                  ElementType = MET_FLOAT\nElementDataFile = LOCAL\n";
+    vec![volume_file(header.as_bytes()), volume_file(&metaimage::header_of(&exported()))]
+}
+
+fn nifti_files() -> Vec<Vec<u8>> {
+    vec![volume_file(&nifti::header_of(&exported()))]
+}
+
+fn npy_volumes() -> Vec<Vec<u8>> {
+    vec![written("c.npy", |p| npy::write(p, &[3, 4, 5], &[0.5; 60]).unwrap())]
+}
+
+fn npy_images() -> Vec<Vec<u8>> {
+    vec![written("s.npy", |p| npy::write(p, &[6, 10], &[0.5; 60]).unwrap())]
+}
+
+fn png_images() -> Vec<Vec<u8>> {
+    let codes8: Vec<u8> = (0..60).collect();
+    let codes16: Vec<u16> = (0..60).map(|i| 1000 * i).collect();
+    vec![png::grey8(10, 6, &codes8).unwrap(), written("i.png", |p| png::write_grey16(p, 10, 6, codes16).unwrap())]
+}
+
+fn reads_tree(path: &Path) -> bool {
+    // Its shapes are made as well, since they index its points.
+    TreeFile::read(path).is_ok_and(|tree| !tree.at(0.3).branches.is_empty())
+}
+
+fn vtp_trees() -> Vec<Vec<u8>> {
+    let lines = Lines {
+        title: "two lines".into(),
+        time: 0.0,
+        points: (0..5).map(|i| [f64::from(i), 2.0, -3.0]).collect(),
+        counts: vec![3, 2],
+        of_points: vec![Values::Float("Radius", vec![1.0, 0.9, 0.8, 0.7, 0.6])],
+        of_lines: vec![Values::Int("branch", vec![0, 1])],
+    };
+    vec![lines.to_vtp().into_bytes()]
+}
+
+fn json_trees() -> Vec<Vec<u8>> {
+    let tree = r#"{"branches":[{"name":"a","first":0,"count":3},{"name":"b","first":3,"count":2}],"radius_mm":[2,1.5,1,1,0.5],
+        "points_mm":[[[0,0,0],[5,0,1],[10,0,2],[5,0,1],[5,8,1]],[[0,1,0],[5,1,1],[10,1,2],[5,1,1],[5,9,1]]]}"#;
+    vec![tree.as_bytes().to_vec()]
+}
+
+/// A dataset in which one file is replaced by the file that is parsed.
+struct Around {
+    layout: Layout,
+    file: &'static str,
+    made: OnceLock<(tempfile::TempDir, PathBuf)>,
+}
+
+static NATIVE: Around = Around { layout: Layout::Native, file: "dataset.json", made: OnceLock::new() };
+static GEOMETRY: Around = Around { layout: Layout::Nerfca, file: "general.json", made: OnceLock::new() };
+static FRAMES: Around = Around { layout: Layout::Nerfca, file: "train-0.json", made: OnceLock::new() };
+
+impl Around {
+    fn dataset(&self) -> &Path {
+        &self
+            .made
+            .get_or_init(|| {
+                let directory = scratch();
+                let out = directory.path().join("data");
+                nertca_vk::scan::writer::convert(&common::small_dataset(8, 8), self.layout, &out).unwrap();
+                (directory, out)
+            })
+            .1
+    }
+}
+
+fn manifest(around: &Around) -> Vec<u8> {
+    std::fs::read(around.dataset().join(around.file)).unwrap()
+}
+
+fn opens(around: &Around, path: &Path) -> bool {
+    std::fs::copy(path, around.dataset().join(around.file)).unwrap();
+    Dataset::open(around.dataset()).is_ok()
+}
+
+fn checkpoints() -> Vec<Vec<u8>> {
+    let data = common::small_dataset(8, 8);
+    let config = common::small_config(
+        "fast-mlp",
+        &["static.grid=3", "dynamic.width=16", "dynamic.layers=2", "occupancy.enabled=false"],
+    );
+    let gpu = Gpu::open(&DeviceOptions::default()).unwrap();
+    let plan = Plan::new(&config, &data).unwrap();
+    vec![Trainer::new(&gpu, plan, &data, common::tuning(&gpu)).unwrap().checkpoint().unwrap().to_bytes().unwrap()]
+}
+
+#[cfg(feature = "dicom")]
+fn angiograms() -> Vec<Vec<u8>> {
+    vec![written("a.dcm", |p| crate::dicom::angiogram(p, |_| ()))]
+}
