@@ -115,6 +115,7 @@ pub mod scan {
     pub(crate) mod hidden;
     pub mod nerfca;
     mod reading;
+    pub(crate) mod same_view;
     pub mod truth;
     pub mod writer;
 }

@@ -7,6 +7,7 @@ use crate::import::dicom::Run;
 use crate::scan::canvas::in_words;
 use crate::scan::dataset::{Layout, Split};
 use crate::scan::frame_checks::{check_values, checked_view};
+use crate::scan::same_view::find_or_add;
 use crate::scan::writer::{About, Writer};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
@@ -142,11 +143,12 @@ impl Intake {
             if !sizes.contains(&size) {
                 sizes.push(size);
             }
-            let view = views.iter().position(|view| *view == (c_arm, size)).unwrap_or_else(|| {
-                views.push((c_arm, size));
-                views.len() - 1
-            });
-            writer.frame(&Geometry::CArm(c_arm.clone()), Split::Train, view, *taken, image, None)?;
+            // A dataset that is read has the same views.
+            let geometry = Geometry::CArm(c_arm.clone());
+            let depth_before = self.options.depth_half_extent_mm / MM_PER_UNIT;
+            let view = find_or_add(&mut views, geometry.clone(), size, depth_before)
+                .map_err(|found| Error::config(found.field, found.value, found.problem))?;
+            writer.frame(&geometry, Split::Train, view, *taken, image, None)?;
         }
         writer.finish()?;
         Ok(format!("{} views of {} pixels at {} phases", views.len(), in_words(&sizes), self.phases()))

@@ -1,13 +1,7 @@
 //! Groups the frames of a run by C-arm pose: a moving C-arm or table gives a run several views.
 
-use crate::geometry::{CArm, Geometry, ViewRays, world_from_lps_mm};
-use glam::DVec3;
-
-/// Distance below which two frames belong to the same view, pixels: the largest between their projections of points of the
-/// heart.
-const SAME_VIEW_PX: f64 = 0.1;
-/// Half side of a cube around the isocentre that represents the heart, mm.
-const HEART_MM: f64 = 50.0;
+use crate::geometry::{CArm, Geometry, ViewRays};
+use crate::scan::same_view::agree;
 
 /// Returns, for each frame, the index of the first frame with the same pose; images have `size` (columns, rows).
 pub(super) fn stands(c_arms: &[CArm], size: [usize; 2]) -> Vec<usize> {
@@ -15,7 +9,7 @@ pub(super) fn stands(c_arms: &[CArm], size: [usize; 2]) -> Vec<usize> {
         c_arms.iter().map(|c_arm| Geometry::CArm(c_arm.clone()).rays(size[0], size[1]).ok()).collect();
     let same = |a: usize, b: usize| match (&rays[a], &rays[b]) {
         _ if c_arms[a] == c_arms[b] => true,
-        (Some(a), Some(b)) => apart_px(a, b) < SAME_VIEW_PX,
+        (Some(a), Some(b)) => agree(a, b),
         _ => false,
     };
     let mut first: Vec<usize> = Vec::new();
@@ -27,18 +21,6 @@ pub(super) fn stands(c_arms: &[CArm], size: [usize; 2]) -> Vec<usize> {
             })
         })
         .collect()
-}
-
-/// Largest distance between the projections of a point of the heart in two views, pixels.
-fn apart_px(a: &ViewRays, b: &ViewRays) -> f64 {
-    let sign = |k: usize, axis: usize| if k >> axis & 1 == 1 { HEART_MM } else { -HEART_MM };
-    let corners = (0..8).map(|k| DVec3::new(sign(k, 0), sign(k, 1), sign(k, 2)));
-    let apart = |lps_mm: DVec3| {
-        let point = world_from_lps_mm(lps_mm);
-        let ((x, y), (u, v)) = a.project(point).zip(b.project(point))?;
-        Some((x - u).hypot(y - v))
-    };
-    corners.map(|corner| apart(corner).unwrap_or(f64::INFINITY)).fold(0.0, f64::max)
 }
 
 #[cfg(test)]

@@ -5,8 +5,9 @@ use crate::geometry::Geometry;
 use crate::raster::Image;
 use crate::scan::canvas::onto_canvas;
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
-use crate::scan::frame_checks::{Complaint, check_phase, check_values, checked_view};
+use crate::scan::frame_checks::{Complaint, check_phase, check_values};
 use crate::scan::gating::BeatTime;
+use crate::scan::same_view::find_or_add;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -80,15 +81,9 @@ impl Builder {
         let taken = BeatTime::of(new.time_phases, self.n_phases);
         let size = [new.image.width, new.image.height];
         check_values(&new.image.values, size[0]).map_err(|c| told(new.source, c))?;
-        let view = match self.views.iter().position(|v| v.geometry == new.geometry && v.size == size) {
-            Some(view) => view,
-            None => {
-                let of_geometry = |c: Complaint| Complaint { field: format!("geometry.{}", c.field), ..c };
-                let view = checked_view(new.geometry, size, -self.depth_range.0);
-                self.views.push(view.map_err(|c| told(&self.file, of_geometry(c)))?);
-                self.views.len() - 1
-            }
-        };
+        let of_geometry = |c: Complaint| Complaint { field: format!("geometry.{}", c.field), ..c };
+        let view = find_or_add(&mut self.views, new.geometry, size, -self.depth_range.0)
+            .map_err(|c| told(&self.file, of_geometry(c)))?;
         self.frames.push(Frame {
             name: new
                 .source
