@@ -124,13 +124,18 @@ pub mod scan {
 #[cfg(feature = "dicom")]
 pub mod import {
     pub mod angiograms;
+    mod codecs;
     pub mod dicom;
     pub mod ecg;
+    mod elements;
     pub mod folder;
+    mod frames;
     pub mod image_beat;
     pub mod intake;
-    mod lengths;
+    mod reader;
     mod stands;
+    mod timing;
+    mod traces;
 }
 
 /// Evidence of each single view: its static background, its noise, and where vessels may be.

@@ -3,13 +3,14 @@
 use crate::error::{Error, Result};
 use crate::fingerprint::Fingerprint;
 use crate::geometry::CArm;
-use crate::import::{ecg, lengths};
+use crate::import::codecs::Codec;
+use crate::import::elements::{self, Content, numbers};
+use crate::import::frames::{self, Layout};
+use crate::import::reader::Reader;
+use crate::import::{timing, traces};
 use crate::scan::gating::RPeaks;
-use dicom_core::header::HasLength;
 use dicom_core::{Tag, VR};
 use dicom_dictionary_std::tags;
-use dicom_object::{FileDicomObject, InMemDicomObject, OpenFileOptions};
-use dicom_pixeldata::{ConvertOptions, ModalityLutOption, PixelDecoder, VoiLutOption};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -63,51 +64,70 @@ pub struct Run {
     pub notes: Vec<String>,
 }
 
-type Object = FileDicomObject<InMemDicomObject>;
-
-struct Reader<'a> {
-    object: &'a Object,
-    path: &'a Path,
-}
-
 impl Reader<'_> {
-    fn bad(&self, tag: Tag, name: &str, problem: impl Into<String>) -> Error {
-        Error::data(self.path, format!("({:04X},{:04X}) {name}", tag.group(), tag.element()), problem)
-    }
-
-    fn text(&self, tag: Tag) -> Option<String> {
-        let text = self.object.get(tag)?.to_str().ok()?;
-        let text = text.trim_matches(|c: char| c.is_whitespace() || c == '\0').to_owned();
-        (!text.is_empty()).then_some(text)
-    }
-
-    fn numbers(&self, tag: Tag, name: &str) -> Result<Option<Vec<f64>>> {
-        let Some(element) = self.object.get(tag).filter(|e| !e.is_empty()) else { return Ok(None) };
-        let numbers = element.to_multi_float64().map_err(|e| self.bad(tag, name, format!("is not a number: {e}")))?;
-        match numbers.iter().find(|v| !v.is_finite()) {
-            Some(bad) => Err(self.bad(tag, name, format!("{bad} is not finite"))),
-            None => Ok(Some(numbers).filter(|n| !n.is_empty())),
-        }
-    }
-
-    fn number(&self, tag: Tag, name: &str) -> Result<Option<f64>> {
-        Ok(self.numbers(tag, name)?.map(|n| n[0]))
-    }
-
-    fn needed(&self, tag: Tag, name: &str) -> Result<f64> {
-        self.number(tag, name)?.ok_or_else(|| self.bad(tag, name, "is missing"))
-    }
-
     /// Returns one value per frame from a base and increments: one for each frame, or a single increment that is repeated.
-    fn per_frame(&self, base: f64, tag: Tag, name: &str, frames: usize) -> Result<Vec<f64>> {
-        Ok(match self.numbers(tag, name)? {
-            Some(steps) if steps.len() == frames => steps.iter().map(|s| base + s).collect(),
-            Some(steps) if steps.len() == 1 => (0..frames).map(|i| base + i as f64 * steps[0]).collect(),
-            Some(steps) => {
-                return Err(self.bad(tag, name, format!("has {} values for {frames} frames", steps.len())));
+    fn per_frame(&self, base: f64, tag: Tag, name: &str, frames: usize, notes: &mut Vec<String>) -> Result<Vec<f64>> {
+        let Some(steps) = self.numbers(tag, name)? else { return Ok(vec![base; frames]) };
+        if let [step] = steps[..]
+            && frames > 1
+        {
+            if step != 0.0 {
+                notes.push(format!(
+                    "{name} has one value for {frames} frames: {step} is added from each frame to the next"
+                ));
             }
-            None => vec![base; frames],
-        })
+            return Ok((0..frames).map(|i| base + i as f64 * step).collect());
+        }
+        if steps.len() != frames {
+            return Err(self.bad(tag, name, format!("has {} values for {frames} frames", steps.len())));
+        }
+        if steps.iter().any(|step| *step != 0.0) {
+            let (low, high) = steps.iter().fold((f64::MAX, f64::MIN), |(low, high), s| (low.min(*s), high.max(*s)));
+            notes.push(format!(
+                "{name}: its values, {low} to {high}, are taken as differences from the first position, as DICOM says, not from \
+                 the frame before"
+            ));
+            let repeated = frames > 2 && steps[1] != 0.0 && steps[1..].iter().all(|step| *step == steps[1]);
+            if repeated {
+                notes.push(format!(
+                    "warning: {name} is {} for every frame after the first: if the motion goes on from frame to frame, the file \
+                     states it wrongly, and a single value of {} would be read as that",
+                    steps[1], steps[1]
+                ));
+            }
+        }
+        Ok(steps.iter().map(|step| base + step).collect())
+    }
+
+    /// Distances from the source to the detector and to the patient, mm.
+    fn distances(&self, notes: &mut Vec<String>) -> Result<[f64; 2]> {
+        let positive = |tag, name| -> Result<Option<f64>> { Ok(self.number(tag, name)?.filter(|value| *value > 0.0)) };
+        let sid_mm = positive(tags::DISTANCE_SOURCE_TO_DETECTOR, "DistanceSourceToDetector")?;
+        let sod_mm = positive(tags::DISTANCE_SOURCE_TO_PATIENT, "DistanceSourceToPatient")?;
+        let factor =
+            positive(tags::ESTIMATED_RADIOGRAPHIC_MAGNIFICATION_FACTOR, "EstimatedRadiographicMagnificationFactor")?;
+        match (sid_mm, sod_mm, factor.filter(|factor| *factor > 1.0)) {
+            (Some(sid_mm), None, Some(factor)) => {
+                notes.push(format!(
+                    "DistanceSourceToPatient is missing: {:.1} mm are used, which is DistanceSourceToDetector over \
+                     EstimatedRadiographicMagnificationFactor ({factor})",
+                    sid_mm / factor
+                ));
+                Ok([sid_mm, sid_mm / factor])
+            }
+            (None, Some(sod_mm), Some(factor)) => {
+                notes.push(format!(
+                    "DistanceSourceToDetector is missing: {:.1} mm are used, which is DistanceSourceToPatient times \
+                     EstimatedRadiographicMagnificationFactor ({factor})",
+                    sod_mm * factor
+                ));
+                Ok([sod_mm * factor, sod_mm])
+            }
+            _ => Ok([
+                self.needed(tags::DISTANCE_SOURCE_TO_DETECTOR, "DistanceSourceToDetector")?,
+                self.needed(tags::DISTANCE_SOURCE_TO_PATIENT, "DistanceSourceToPatient")?,
+            ]),
+        }
     }
 }
 
@@ -118,18 +138,15 @@ impl Run {
     /// [`Error::Data`] naming file and tag; [`Error::Io`].
     pub fn read(path: &Path, pixel_mm: Option<[f64; 2]>) -> Result<Run> {
         let meta = std::fs::metadata(path).map_err(Error::io("read", path))?;
-        if !meta.is_file() || meta.len() > MAX_FILE_BYTES || meta.len() < 132 {
-            let problem =
-                format!("{} bytes are not in the accepted range of DICOM files, 132 bytes to 4 GiB", meta.len());
+        if meta.len() > MAX_FILE_BYTES {
+            let problem = format!("{} bytes are more than the accepted 4 GiB", meta.len());
             return Err(Error::data(path, "size", problem));
         }
-        lengths::check(path)?;
-        let object = OpenFileOptions::new()
-            .open_file(path)
-            .map_err(|e| Error::data(path, "DICOM", format!("cannot be read: {}", describe(&e))))?;
-        let r = Reader { object: &object, path };
-        let mut notes = Vec::new();
+        let Content { syntax, data, mut notes } = elements::read(path)?;
+        let r = Reader { data: &data, path };
         r.check_modality()?;
+        let codec =
+            Codec::of(&syntax).map_err(|problem| r.bad(tags::TRANSFER_SYNTAX_UID, "TransferSyntaxUID", problem))?;
         let side = |tag, name| -> Result<usize> {
             let n = r.needed(tag, name)?;
             if n.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE)).contains(&n) {
@@ -153,14 +170,14 @@ impl Run {
             ));
         }
         let c_arms = r.c_arms(n, [width, height], pixel_mm, &mut notes)?;
-        let times_s = r.times(n, &mut notes)?;
+        let times_s = timing::times(&r, n, &mut notes)?;
         let table = r.modality_table()?;
         let relationship = match table {
             // Part 3, C.8.7.1.1.2: the table of an angiogram leads from stored values to values linear in intensity.
             Some(_) => Relationship::Linear,
             None => r.relationship(&mut notes),
         };
-        let (frames, range) = r.frames(n, width * height, table.as_ref(), &mut notes)?;
+        let (frames, range) = r.frames(codec, n, [width, height], table.as_ref(), &mut notes)?;
         let r_peaks = r.r_peaks(&times_s, &mut notes);
         let hashed = |tag| Fingerprint::of(r.text(tag).unwrap_or_default().as_bytes()).value();
         let identity = [tags::PATIENT_ID, tags::STUDY_INSTANCE_UID].map(hashed);
@@ -187,17 +204,6 @@ impl Run {
     pub fn name(&self) -> String {
         self.path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
     }
-}
-
-/// Message of an error with its causes.
-fn describe(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(next) = cause {
-        text = format!("{text}: {next}");
-        cause = next.source();
-    }
-    text
 }
 
 impl Reader<'_> {
@@ -227,11 +233,10 @@ impl Reader<'_> {
         let primary = self.needed(tags::POSITIONER_PRIMARY_ANGLE, "PositionerPrimaryAngle")?;
         let secondary = self.needed(tags::POSITIONER_SECONDARY_ANGLE, "PositionerSecondaryAngle")?;
         let turn = tags::POSITIONER_PRIMARY_ANGLE_INCREMENT;
-        let primary = self.per_frame(primary, turn, "PositionerPrimaryAngleIncrement", n)?;
+        let primary = self.per_frame(primary, turn, "PositionerPrimaryAngleIncrement", n, notes)?;
         let turn = tags::POSITIONER_SECONDARY_ANGLE_INCREMENT;
-        let secondary = self.per_frame(secondary, turn, "PositionerSecondaryAngleIncrement", n)?;
-        let sid_mm = self.needed(tags::DISTANCE_SOURCE_TO_DETECTOR, "DistanceSourceToDetector")?;
-        let sod_mm = self.needed(tags::DISTANCE_SOURCE_TO_PATIENT, "DistanceSourceToPatient")?;
+        let secondary = self.per_frame(secondary, turn, "PositionerSecondaryAngleIncrement", n, notes)?;
+        let [sid_mm, sod_mm] = self.distances(notes)?;
         let spacing = self.numbers(tags::IMAGER_PIXEL_SPACING, "ImagerPixelSpacing")?;
         let pixel_mm = match (given, spacing, self.numbers(tags::FIELD_OF_VIEW_DIMENSIONS, "FieldOfViewDimensions")?) {
             (Some(pixel_mm), ..) => pixel_mm,
@@ -253,9 +258,9 @@ impl Reader<'_> {
         // DICOM's table height is positive below the isocentre, so a larger height moves the patient towards posterior.
         let height = self.number(tags::TABLE_HEIGHT, "TableHeight")?.unwrap_or(0.0);
         let lateral = self.number(tags::TABLE_TRAVERSE, "TableTraverse")?.unwrap_or(0.0);
-        let down = self.per_frame(height, tags::TABLE_VERTICAL_INCREMENT, "TableVerticalIncrement", n)?;
-        let left = self.per_frame(lateral, tags::TABLE_LATERAL_INCREMENT, "TableLateralIncrement", n)?;
-        let along = self.per_frame(0.0, tags::TABLE_LONGITUDINAL_INCREMENT, "TableLongitudinalIncrement", n)?;
+        let down = self.per_frame(height, tags::TABLE_VERTICAL_INCREMENT, "TableVerticalIncrement", n, notes)?;
+        let left = self.per_frame(lateral, tags::TABLE_LATERAL_INCREMENT, "TableLateralIncrement", n, notes)?;
+        let along = self.per_frame(0.0, tags::TABLE_LONGITUDINAL_INCREMENT, "TableLongitudinalIncrement", n, notes)?;
         let position = self.text(tags::PATIENT_POSITION).unwrap_or_default();
         if !["HFS", ""].contains(&position.as_str()) {
             notes.push(format!(
@@ -278,38 +283,6 @@ impl Reader<'_> {
         rays.map(|_| arms).map_err(|(field, problem)| Error::data(self.path, tag_of(&field), problem))
     }
 
-    fn times(&self, n: usize, notes: &mut Vec<String>) -> Result<Vec<f64>> {
-        let vector = tags::FRAME_TIME_VECTOR;
-        if let Some(steps) = self.numbers(vector, "FrameTimeVector")? {
-            if steps.len() != n {
-                return Err(self.bad(vector, "FrameTimeVector", format!("has {} values for {n} frames", steps.len())));
-            }
-            let mut now = 0.0;
-            return Ok(steps
-                .iter()
-                .enumerate()
-                .map(|(i, step)| {
-                    now += if i == 0 { 0.0 } else { step / 1e3 };
-                    now
-                })
-                .collect());
-        }
-        let step_ms = match self.number(tags::FRAME_TIME, "FrameTime")? {
-            Some(ms) => ms,
-            None => match self.number(tags::CINE_RATE, "CineRate")? {
-                Some(rate) if rate > 0.0 => 1e3 / rate,
-                _ => {
-                    notes.push("frame times are missing: 15 frames per second are assumed".into());
-                    1e3 / 15.0
-                }
-            },
-        };
-        if step_ms <= 0.0 {
-            return Err(self.bad(tags::FRAME_TIME, "FrameTime", format!("{step_ms} ms is not positive")));
-        }
-        Ok((0..n).map(|i| i as f64 * step_ms / 1e3).collect())
-    }
-
     fn relationship(&self, notes: &mut Vec<String>) -> Relationship {
         match self.text(tags::PIXEL_INTENSITY_RELATIONSHIP).as_deref() {
             Some("LIN") => Relationship::Linear,
@@ -328,10 +301,12 @@ impl Reader<'_> {
     /// Reads the table of the Modality LUT Sequence.
     fn modality_table(&self) -> Result<Option<ModalityTable>> {
         let tag = tags::MODALITY_LUT_SEQUENCE;
-        let Some(sequence) = self.object.get(tag) else { return Ok(None) };
+        if self.get(tag).is_none() {
+            return Ok(None);
+        }
         let bad = |problem: &str| self.bad(tag, "ModalityLUTSequence", problem);
-        let item = sequence.items().and_then(|items| items.first()).ok_or_else(|| bad("has no item"))?;
-        let descriptor = item.get(tags::LUT_DESCRIPTOR).and_then(|element| element.to_multi_float64().ok());
+        let item = self.item(tag, "ModalityLUTSequence")?.ok_or_else(|| bad("has no item"))?;
+        let descriptor = item.numbers(tags::LUT_DESCRIPTOR, "LUTDescriptor")?;
         let Some(&[entries, first, _]) = descriptor.as_deref() else {
             return Err(bad("its LUTDescriptor does not have three numbers"));
         };
@@ -339,12 +314,11 @@ impl Reader<'_> {
         let entries = if entries == 0.0 { 1 << 16 } else { entries as usize };
         let first = if self.is_signed()? && first > f64::from(i16::MAX) { first - 65536.0 } else { first };
         let data = item.get(tags::LUT_DATA).ok_or_else(|| bad("has no LUTData"))?;
-        let values: Vec<f32> = match data.vr() {
-            VR::OW | VR::UN => {
-                let bytes = data.to_bytes().map_err(|e| bad(&e.to_string()))?;
-                bytes.chunks_exact(2).map(|word| f32::from(u16::from_le_bytes([word[0], word[1]]))).collect()
+        let values: Vec<f32> = match (data.vr, data.bytes()) {
+            (VR::OB, Some((bytes, big_endian))) => {
+                numbers(bytes, big_endian, |b| f32::from(u16::from_le_bytes(b))).map_err(|problem| bad(&problem))?
             }
-            _ => data.to_multi_float32().map_err(|e| bad(&e.to_string()))?,
+            _ => data.numbers().map_err(|problem| bad(&problem))?.into_iter().map(|value| value as f32).collect(),
         };
         if values.len() < entries || entries < 2 {
             return Err(bad(&format!("has {} values where its LUTDescriptor states {entries}", values.len())));
@@ -360,23 +334,42 @@ impl Reader<'_> {
     /// values, which follows from the bits stored and from the LUT, not from the values of this run.
     fn frames(
         &self,
+        codec: Codec,
         n: usize,
-        pixels: usize,
+        size: [usize; 2],
         table: Option<&ModalityTable>,
         notes: &mut Vec<String>,
     ) -> Result<(Vec<Vec<f32>>, PixelRange)> {
-        let tag = tags::PIXEL_DATA;
-        if self.object.get(tag).is_none() {
-            return Err(self.bad(tag, "PixelData", "is missing"));
-        }
         let bits = self.number(tags::BITS_STORED, "BitsStored")?.unwrap_or(8.0);
-        if !(1.0..=16.0).contains(&bits) {
+        if bits.fract() != 0.0 || !(1.0..=16.0).contains(&bits) {
             return Err(self.bad(
                 tags::BITS_STORED,
                 "BitsStored",
                 format!("{bits} is not in the accepted range, 1 to 16"),
             ));
         }
+        let allocated =
+            self.number(tags::BITS_ALLOCATED, "BitsAllocated")?.unwrap_or(if bits > 8.0 { 16.0 } else { 8.0 });
+        if ![8.0, 16.0, 32.0].contains(&allocated) || allocated < bits {
+            let problem = format!("{allocated} is not accepted for {bits} bits stored; 8, 16 and 32 are read");
+            return Err(self.bad(tags::BITS_ALLOCATED, "BitsAllocated", problem));
+        }
+        let high_bit = self.number(tags::HIGH_BIT, "HighBit")?.unwrap_or(bits - 1.0);
+        if !(bits - 1.0..allocated).contains(&high_bit) {
+            let problem = format!("{high_bit} does not fit {bits} bits stored of {allocated}");
+            return Err(self.bad(tags::HIGH_BIT, "HighBit", problem));
+        }
+        let signed = self.is_signed()?;
+        let layout = Layout {
+            frames: n,
+            size,
+            bytes_per_value: allocated as usize / 8,
+            bits: bits as u32,
+            high_bit: high_bit as u32,
+            signed,
+        };
+        let mut frames = frames::decode(self.data, codec, &layout, notes)
+            .map_err(|problem| self.bad(tags::PIXEL_DATA, "PixelData", problem))?;
         let slope = self.number(tags::RESCALE_SLOPE, "RescaleSlope")?.unwrap_or(1.0);
         let intercept = self.number(tags::RESCALE_INTERCEPT, "RescaleIntercept")?.unwrap_or(0.0);
         let is_rescaled = slope != 1.0 || intercept != 0.0;
@@ -389,28 +382,6 @@ impl Reader<'_> {
             None if is_rescaled => notes.push("the modality LUT was applied, but not the VOI LUT and the window".into()),
             None => {}
         }
-        let modality = if table.is_some() { ModalityLutOption::None } else { ModalityLutOption::Default };
-        // A decoder may panic on malformed data; the panic becomes an ordinary error of this file.
-        let decode = |frame: usize| -> std::result::Result<Vec<f32>, String> {
-            let decoded = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
-                let options =
-                    ConvertOptions::new().with_modality_lut(modality.clone()).with_voi_lut(VoiLutOption::Identity);
-                let frame = self.object.decode_pixel_data_frame(frame as u32).map_err(|e| describe(&e))?;
-                frame.to_vec_with_options::<f32>(&options).map_err(|e| describe(&e))
-            }));
-            decoded.unwrap_or_else(|_| Err("the decoder failed".into()))
-        };
-        let mut frames = (0..n)
-            .map(|i| {
-                let bad = |problem: String| self.bad(tag, "PixelData", format!("frame {i}: {problem}"));
-                let values = decode(i).map_err(bad)?;
-                match values.len() {
-                    found if found == pixels && values.iter().all(|v| v.is_finite()) => Ok(values),
-                    found => Err(bad(format!("has {found} finite values where {pixels} are needed"))),
-                }
-            })
-            .collect::<Result<Vec<Vec<f32>>>>()?;
-        let signed = self.is_signed()?;
         let span = 2f64.powf(bits) - 1.0;
         let stored = if signed { [-(span + 1.0) / 2.0, (span - 1.0) / 2.0] } else { [0.0, span] };
         let range = match table {
@@ -419,7 +390,11 @@ impl Reader<'_> {
                 PixelRange { black: 0.0, low: table.low(), white: table.high() }
             }
             None => {
-                let [a, b] = stored.map(|value| (slope * value + intercept) as f32);
+                let rescaled = |value: f64| (slope * value + intercept) as f32;
+                if is_rescaled {
+                    frames.iter_mut().flatten().for_each(|value| *value = rescaled(f64::from(*value)));
+                }
+                let [a, b] = stored.map(rescaled);
                 // Rescaled values are intensities themselves; others may be stored with an offset, as signed numbers.
                 let (low, white) = (a.min(b), a.max(b));
                 PixelRange { black: if is_rescaled { 0.0 } else { low }, low, white }
@@ -455,62 +430,28 @@ impl Reader<'_> {
 
     /// R-peaks that the file lists, or else those found in its ECG.
     fn r_peaks(&self, times_s: &[f64], notes: &mut Vec<String>) -> Option<RPeaks> {
-        let listed = self.numbers(tags::R_WAVE_TIME_VECTOR, "RWaveTimeVector").ok().flatten();
-        if let Some(peaks) = listed.and_then(|ms| RPeaks::new(&ms.iter().map(|t| t / 1e3).collect::<Vec<_>>()).ok()) {
-            notes.push("R-peaks from RWaveTimeVector".into());
-            return Some(peaks);
-        }
-        let (source, trace, rate) = self.waveform().or_else(|| self.curve(times_s))?;
-        match ecg::r_peaks(&trace, rate) {
-            Ok(peaks) => {
-                notes.push(format!(
-                    "R-peaks found in the ECG of {source}: {:.0} beats per minute",
-                    60.0 / peaks.beat_s()
-                ));
-                Some(peaks)
+        let (tag, name) = (tags::R_WAVE_TIME_VECTOR, "RWaveTimeVector");
+        let listed = self.numbers(tag, name).and_then(|ms| {
+            let seconds = ms.map(|ms| ms.iter().map(|t| t / 1e3).collect::<Vec<_>>());
+            seconds.map(|seconds| RPeaks::new(&seconds)).transpose()
+        });
+        match listed {
+            Ok(Some(peaks)) => {
+                notes.push("R-peaks from RWaveTimeVector".into());
+                return Some(peaks);
             }
-            Err(error) => {
-                notes.push(format!("the ECG of {source} was not used: {error}"));
-                None
-            }
+            Ok(None) => {}
+            Err(error) => notes.push(format!("RWaveTimeVector was not used: {error}")),
         }
+        traces::r_peaks(self, length_s(times_s), notes)
     }
+}
 
-    /// Reads the first channel of the first waveform.
-    fn waveform(&self) -> Option<(&'static str, Vec<f64>, f64)> {
-        let item = self.object.get(tags::WAVEFORM_SEQUENCE)?.items()?.first()?;
-        let number = |tag| item.get(tag)?.to_float64().ok();
-        let channels = number(tags::NUMBER_OF_WAVEFORM_CHANNELS)? as usize;
-        let rate = number(tags::SAMPLING_FREQUENCY)?;
-        let signed = item.get(tags::WAVEFORM_SAMPLE_INTERPRETATION)?.to_str().ok()?.trim() == "SS";
-        let bytes = item.get(tags::WAVEFORM_DATA)?.to_bytes().ok()?;
-        let step = 2 * channels;
-        if channels == 0 || channels > 64 || !signed || bytes.len() > 64 << 20 {
-            return None;
-        }
-        let trace = bytes.chunks_exact(step).map(|s| f64::from(i16::from_le_bytes([s[0], s[1]]))).collect();
-        Some(("WaveformSequence", trace, rate))
-    }
-
-    /// Reads the ECG from the retired curve group 5000, which spans the run.
-    fn curve(&self, times_s: &[f64]) -> Option<(&'static str, Vec<f64>, f64)> {
-        if self.text(Tag(0x5000, 0x0020))? != "ECG" {
-            return None;
-        }
-        let dimensions = self.number(Tag(0x5000, 0x0005), "CurveDimensions").ok().flatten().unwrap_or(1.0);
-        let kind = self.number(Tag(0x5000, 0x0103), "DataValueRepresentation").ok().flatten()?;
-        let bytes = self.object.get(Tag(0x5000, 0x3000))?.to_bytes().ok()?;
-        if dimensions != 1.0 || bytes.len() > 64 << 20 {
-            return None;
-        }
-        let trace: Vec<f64> = match kind as u32 {
-            0 => bytes.chunks_exact(2).map(|b| f64::from(u16::from_le_bytes([b[0], b[1]]))).collect(),
-            1 => bytes.chunks_exact(2).map(|b| f64::from(i16::from_le_bytes([b[0], b[1]]))).collect(),
-            2 => bytes.chunks_exact(4).map(|b| f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]]))).collect(),
-            _ => return None,
-        };
-        let length_s = times_s.last()? + times_s.get(1).copied().unwrap_or(0.0);
-        Some(("CurveData", trace.clone(), trace.len() as f64 / length_s))
+/// Length of a run, seconds: its last frame lasts as long as the one before.
+fn length_s(times_s: &[f64]) -> f64 {
+    match times_s {
+        [.., before, last] => last + (last - before),
+        _ => 0.0,
     }
 }
 

@@ -8,11 +8,19 @@ const SHORTEST_BEAT_S: f64 = 0.3;
 /// Width of a QRS complex, seconds.
 const QRS_S: f64 = 0.12;
 
-/// Returns the times of the R-peaks of a trace with `rate_hz` samples per second, whose first sample is at time 0.
+/// Returns the R-peaks of a trace with `rate_hz` samples per second, whose first sample is at time 0.
 ///
 /// # Errors
 /// [`Error::Config`] for an unusable trace, or one with fewer than two R-peaks.
 pub fn r_peaks(trace: &[f64], rate_hz: f64) -> Result<RPeaks> {
+    RPeaks::new(&peak_times_s(trace, rate_hz)?)
+}
+
+/// Returns the times of the R-peaks of a trace with `rate_hz` samples per second, in seconds after its first sample.
+///
+/// # Errors
+/// [`Error::Config`] for an unusable trace.
+pub(super) fn peak_times_s(trace: &[f64], rate_hz: f64) -> Result<Vec<f64>> {
     if !(rate_hz.is_finite() && (20.0..=20_000.0).contains(&rate_hz)) {
         return Err(Error::config("ECG", rate_hz, "is not in the accepted range, 20 to 20000 samples per second"));
     }
@@ -48,7 +56,7 @@ pub fn r_peaks(trace: &[f64], rate_hz: f64) -> Result<RPeaks> {
         }
         i = end + 1;
     }
-    RPeaks::new(&times)
+    Ok(times)
 }
 
 #[cfg(test)]

@@ -15,6 +15,12 @@ mod root;
 mod shared;
 
 #[cfg(feature = "dicom")]
+mod dicom_fragments;
+#[cfg(feature = "dicom")]
+mod dicom_runs;
+#[cfg(feature = "dicom")]
+mod dicom_structure;
+#[cfg(feature = "dicom")]
 mod image_beat;
 #[cfg(feature = "dicom")]
 mod import_frames;
@@ -22,5 +28,7 @@ mod malformed;
 #[cfg(feature = "dicom")]
 mod modality_luts;
 mod nerfca;
+#[cfg(feature = "dicom")]
+mod pydicom;
 mod real_data;
 mod units_and_spaces;

@@ -1,0 +1,174 @@
+//! Transfer syntaxes, and images as they compress them: one frame of grey values at a time.
+
+use crate::import::elements::syntax;
+use jpeg_decoder::{Decoder, PixelFormat, UnsupportedFeature};
+
+/// Bytes of the header of an RLE image: the number of its segments, and 15 offsets.
+const RLE_HEADER_BYTES: usize = 64;
+
+/// Way in which a transfer syntax stores frames.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Codec {
+    /// Numbers as they are, one frame after the other or each in a fragment.
+    Native,
+    Rle,
+    Jpeg,
+}
+
+impl Codec {
+    /// Returns the codec of a transfer syntax.
+    ///
+    /// # Errors
+    /// A sentence that names the codec, and a tool that converts it.
+    pub(super) fn of(uid: &str) -> Result<Codec, String> {
+        match uid {
+            syntax::IMPLICIT | syntax::EXPLICIT | syntax::EXPLICIT_BIG_ENDIAN | syntax::DEFLATED => Ok(Codec::Native),
+            // Encapsulated uncompressed.
+            "1.2.840.10008.1.2.1.98" => Ok(Codec::Native),
+            "1.2.840.10008.1.2.5" => Ok(Codec::Rle),
+            // Baseline, extended, progressive, and lossless with any predictor or the first.
+            "1.2.840.10008.1.2.4.50"
+            | "1.2.840.10008.1.2.4.51"
+            | "1.2.840.10008.1.2.4.55"
+            | "1.2.840.10008.1.2.4.57"
+            | "1.2.840.10008.1.2.4.70" => Ok(Codec::Jpeg),
+            other => Err(not_read(other)),
+        }
+    }
+
+    /// Tells whether each frame ends with the end-of-image marker of the JPEG standards.
+    pub(super) fn has_markers(self) -> bool {
+        matches!(self, Codec::Jpeg)
+    }
+
+    /// Decodes the grey values of a frame of `size` (columns, rows), each with the bits that are stored for it.
+    ///
+    /// # Errors
+    /// The problem of a damaged image, or of one that does not fit the layout.
+    pub(super) fn decode(self, bytes: &[u8], size: [usize; 2], bytes_per_value: usize) -> Result<Vec<u32>, String> {
+        match self {
+            Codec::Native => native(bytes, size[0] * size[1], bytes_per_value, false),
+            Codec::Rle => rle(bytes, size[0] * size[1], bytes_per_value),
+            Codec::Jpeg => jpeg(bytes, size),
+        }
+    }
+}
+
+/// Sentence about a codec that is not read.
+fn not_read(uid: &str) -> String {
+    let (name, tool) = match uid {
+        "1.2.840.10008.1.2.4.80" => ("JPEG-LS", "dcmdjpls"),
+        "1.2.840.10008.1.2.4.81" => ("JPEG-LS near-lossless", "dcmdjpls"),
+        "1.2.840.10008.1.2.4.90" | "1.2.840.10008.1.2.4.91" => ("JPEG 2000", "gdcmconv --raw"),
+        "1.2.840.10008.1.2.4.92" | "1.2.840.10008.1.2.4.93" => ("JPEG 2000 with several components", "gdcmconv --raw"),
+        "1.2.840.10008.1.2.4.201" | "1.2.840.10008.1.2.4.202" | "1.2.840.10008.1.2.4.203" => {
+            ("High-Throughput JPEG 2000", "gdcmconv --raw")
+        }
+        "1.2.840.10008.1.2.4.110" | "1.2.840.10008.1.2.4.111" | "1.2.840.10008.1.2.4.112" => {
+            ("JPEG XL", "gdcmconv --raw")
+        }
+        video if video.starts_with("1.2.840.10008.1.2.4.10") => ("a video (MPEG or HEVC)", "gdcmconv --raw"),
+        uid => {
+            return format!(
+                "{uid} is no transfer syntax that is read; convert the file, for example with `gdcmconv --raw`"
+            );
+        }
+    };
+    format!("is {name} ({uid}), which is not read; convert the file, for example with `{tool} FILE NEW.dcm`")
+}
+
+/// Reads numbers of one, two or four bytes.
+pub(super) fn native(bytes: &[u8], pixels: usize, width: usize, big_endian: bool) -> Result<Vec<u32>, String> {
+    let Some(bytes) = bytes.get(..pixels * width) else {
+        return Err(format!("has {} bytes where {} are needed", bytes.len(), pixels * width));
+    };
+    let number = |part: &[u8]| {
+        let shifted = |sum: u32, byte: &u8| sum << 8 | u32::from(*byte);
+        if big_endian { part.iter().fold(0, shifted) } else { part.iter().rev().fold(0, shifted) }
+    };
+    Ok(bytes.chunks_exact(width).map(number).collect())
+}
+
+/// Decodes an RLE image (Part 5, annex G): a segment for each byte of the values, the most significant first.
+fn rle(bytes: &[u8], pixels: usize, width: usize) -> Result<Vec<u32>, String> {
+    let header = bytes.get(..RLE_HEADER_BYTES).ok_or("its RLE header is incomplete")?;
+    let word = |i: usize| {
+        u32::from_le_bytes([header[4 * i], header[4 * i + 1], header[4 * i + 2], header[4 * i + 3]]) as usize
+    };
+    if word(0) != width {
+        return Err(format!("its RLE image has {} segments where {width} are needed", word(0)));
+    }
+    let mut values = vec![0u32; pixels];
+    for segment in 0..width {
+        let begin = word(segment + 1);
+        let end = if segment + 1 < width { word(segment + 2) } else { bytes.len() };
+        let packed =
+            bytes.get(begin..end).ok_or_else(|| format!("its RLE segment {segment} lies outside the image"))?;
+        let unpacked = unpack(packed, pixels);
+        if unpacked.len() < pixels {
+            return Err(format!("its RLE segment {segment} has {} bytes where {pixels} are needed", unpacked.len()));
+        }
+        values.iter_mut().zip(unpacked).for_each(|(value, byte)| *value = *value << 8 | u32::from(byte));
+    }
+    Ok(values)
+}
+
+/// Unpacks at most `most` bytes that PackBits has packed.
+fn unpack(packed: &[u8], most: usize) -> Vec<u8> {
+    let (mut at, mut out) = (0, Vec::new());
+    while at < packed.len() && out.len() < most {
+        let head = packed[at];
+        at += 1;
+        match head {
+            0..=127 => {
+                let end = (at + usize::from(head) + 1).min(packed.len());
+                out.extend_from_slice(&packed[at..end]);
+                at = end;
+            }
+            // Nothing follows.
+            128 => {}
+            129.. => {
+                let Some(byte) = packed.get(at) else { break };
+                out.resize(out.len() + 257 - usize::from(head), *byte);
+                at += 1;
+            }
+        }
+    }
+    out.truncate(most);
+    out
+}
+
+fn jpeg(bytes: &[u8], size: [usize; 2]) -> Result<Vec<u32>, String> {
+    let mut decoder = Decoder::new(bytes);
+    decoder.read_info().map_err(|error| jpeg_problem(&error))?;
+    let info = decoder.info().ok_or("its JPEG image has no header")?;
+    let found = [usize::from(info.width), usize::from(info.height)];
+    if found != size {
+        return Err(format!(
+            "its JPEG image has {} x {} pixels where {} x {} are needed",
+            found[0], found[1], size[0], size[1]
+        ));
+    }
+    if ![PixelFormat::L8, PixelFormat::L16].contains(&info.pixel_format) {
+        return Err("its JPEG image is in colour, but grey values are needed".into());
+    }
+    let values = decoder.decode().map_err(|error| jpeg_problem(&error))?;
+    Ok(match info.pixel_format {
+        PixelFormat::L8 => values.into_iter().map(u32::from).collect(),
+        _ => values.chunks_exact(2).map(|pair| u16::from_ne_bytes([pair[0], pair[1]]).into()).collect(),
+    })
+}
+
+fn jpeg_problem(error: &jpeg_decoder::Error) -> String {
+    match error {
+        jpeg_decoder::Error::Unsupported(UnsupportedFeature::SamplePrecision(bits)) => format!(
+            "is a lossy JPEG image of {bits} bits per pixel (JPEG extended), which is not read; convert the file, for example \
+             with `dcmdjpeg FILE NEW.dcm`"
+        ),
+        jpeg_decoder::Error::Unsupported(feature) => format!(
+            "is a JPEG image with a feature that is not read ({feature:?}); convert the file, for example with `dcmdjpeg FILE \
+             NEW.dcm`"
+        ),
+        error => format!("its JPEG image cannot be decoded: {error}"),
+    }
+}
