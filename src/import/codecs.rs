@@ -67,7 +67,11 @@ fn not_read(uid: &str) -> String {
         "1.2.840.10008.1.2.4.110" | "1.2.840.10008.1.2.4.111" | "1.2.840.10008.1.2.4.112" => {
             ("JPEG XL", "gdcmconv --raw")
         }
-        video if video.starts_with("1.2.840.10008.1.2.4.10") => ("a video (MPEG or HEVC)", "gdcmconv --raw"),
+        video if video.starts_with("1.2.840.10008.1.2.4.10") => {
+            return format!(
+                "is a video ({video}, MPEG or HEVC), which is not read; export the run as images, or as uncompressed DICOM"
+            );
+        }
         uid => {
             return format!(
                 "{uid} is no transfer syntax that is read; convert the file, for example with `gdcmconv --raw`"

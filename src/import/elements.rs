@@ -14,6 +14,8 @@ use std::path::Path;
 /// Largest accepted nesting depth of sequences.
 const DEEPEST: u32 = 64;
 const UNDEFINED: u32 = u32::MAX;
+/// Largest size of a deflated data set, inflated: a small file could claim a thousand times its own size.
+const MAX_INFLATED_BYTES: u64 = 1 << 30;
 const PREAMBLE_BYTES: u64 = 128;
 const PREFIX: &[u8] = b"DICM";
 /// Shortest element: a tag and a length.
@@ -118,8 +120,16 @@ pub(super) fn read(path: &Path) -> Result<Content> {
     match syntax.as_deref() {
         Some(syntax::DEFLATED) => {
             let mut bytes = Vec::new();
-            let inflated = flate2::read::DeflateDecoder::new(w.file).read_to_end(&mut bytes);
+            let inflated =
+                flate2::read::DeflateDecoder::new(w.file).take(MAX_INFLATED_BYTES + 1).read_to_end(&mut bytes);
             inflated.map_err(|e| Error::data(path, "DICOM", format!("the deflated data set is damaged: {e}")))?;
+            if bytes.len() as u64 > MAX_INFLATED_BYTES {
+                let problem = format!(
+                    "the deflated data set has more than {} MB; convert the file, for example with `dcmconv +te FILE NEW.dcm`",
+                    MAX_INFLATED_BYTES >> 20
+                );
+                return Err(Error::data(path, "DICOM", problem));
+            }
             let end = bytes.len() as u64;
             Walker { file: Cursor::new(bytes), at: 0, end, path }.content(syntax, notes)
         }
