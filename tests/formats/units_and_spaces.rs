@@ -50,6 +50,37 @@ fn volumes_come_out_in_millimetres() {
     assert!(error.contains("xyzt_units") && error.contains("micrometres"), "{error}");
 }
 
+/// Writes a volume with nibabel, changes slope and intercept in its header, and prints its values as nibabel reads them.
+const SCALINGS: &str = r#"
+import math, struct, sys, numpy, nibabel
+image = nibabel.Nifti1Image(numpy.arange(24, dtype=numpy.int16).reshape(2, 3, 4), numpy.eye(4))
+for name, slope, intercept in [
+    ("nan", math.nan, math.nan), ("slope-nan", math.nan, 5.0), ("infinite", math.inf, 5.0), ("zero", 0.0, 5.0), ("plain", 0.5, -2.0),
+    ("inter-nan", 0.5, math.nan),
+]:
+    file = f"{sys.argv[1]}/{name}.nii"
+    image.to_filename(file)
+    data = bytearray(open(file, "rb").read())
+    data[112:120] = struct.pack("<2f", slope, intercept)
+    open(file, "wb").write(data)
+    if name != "inter-nan":
+        print(name, *nibabel.load(file).get_fdata().ravel(order="F"))
+"#;
+
+#[test]
+fn a_slope_that_is_no_number_scales_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    let seen = run(SCALINGS, directory.path());
+    assert_eq!(seen.lines().count(), 5);
+    for line in seen.lines() {
+        let (name, numbers) = line.split_once(' ').unwrap();
+        let want: Vec<f32> = numbers.split(' ').map(|number| number.parse().unwrap()).collect();
+        assert_eq!(nifti::read(&directory.path().join(format!("{name}.nii"))).unwrap().values, want, "{name}");
+    }
+    let error = nifti::read(&directory.path().join("inter-nan.nii")).unwrap_err().to_string();
+    assert!(error.contains("scl_inter: NaN is not finite, but scl_slope is 0.5"), "{error}");
+}
+
 /// Writes one line with VTK in each encoding: without a space, in RAS and in LPS.
 const LINES: &str = r#"
 import sys, vtk

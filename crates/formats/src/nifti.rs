@@ -97,6 +97,10 @@ pub fn read(path: &Path) -> Result<Volume> {
     if volume.dim().len() != axes {
         return Err(bad("dim", format!("{:?} does not agree with the header", volume.dim())));
     }
+    let (slope, intercept) = scaling(&header).map_err(|problem| bad("scl_inter", problem))?;
+    let (kind, raw) = (volume.data_type(), volume.into_raw_data());
+    let volume = InMemNiftiVolume::from_raw_fields(header.dim, kind, slope, intercept, raw, header.endianness)
+        .map_err(|e| bad("data", e.to_string()))?;
     // Nothing is reserved: a header can state a size and no bits per value, so that the file is complete without values.
     let mut values = Vec::new();
     let mut index = vec![0u16; axes];
@@ -119,6 +123,18 @@ pub fn read(path: &Path) -> Result<Volume> {
     let flip = DMat3::from_diagonal(mm_per_unit * DVec3::new(-1.0, -1.0, 1.0));
     let index_to_lps = DAffine3::from_mat3_translation(flip * ras.matrix3, flip * ras.translation);
     Ok(Volume { size, values, index_to_lps })
+}
+
+/// Slope and intercept of the values. A slope that is zero or not finite means that values are not scaled, as to other readers.
+fn scaling(header: &nifti::NiftiHeader) -> std::result::Result<(f32, f32), String> {
+    let (slope, intercept) = (header.scl_slope, header.scl_inter);
+    if slope == 0.0 || !slope.is_finite() {
+        return Ok((1.0, 0.0));
+    }
+    if !intercept.is_finite() {
+        return Err(format!("{intercept} is not finite, but scl_slope is {slope}"));
+    }
+    Ok((slope, intercept))
 }
 
 /// Length of the unit that a header states, mm; files that state none have mm, as other readers assume.
