@@ -1,6 +1,6 @@
 //! ECG traces of a run: channels of its waveforms, and curves of the retired groups 50xx.
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::import::ecg;
 use crate::import::elements::numbers;
 use crate::import::reader::Reader;
@@ -45,10 +45,18 @@ pub(super) fn r_peaks(run: &Reader<'_>, length_s: f64, notes: &mut Vec<String>) 
                 notes.push(format!("R-peaks found in the ECG of {name}{guess}: {rate:.0} beats per minute"));
                 return Some(peaks);
             }
-            Err(error) => notes.push(format!("{name} was not used as an ECG: {error}")),
+            Err(error) => notes.push(format!("{name} was not used as an ECG: {}", reason(&error))),
         }
     }
     None
+}
+
+/// Reason of an error without the name of an option, which nobody has given.
+fn reason(error: &Error) -> String {
+    match error {
+        Error::Config { value, problem, .. } => format!("{value} {problem}"),
+        other => other.to_string(),
+    }
 }
 
 type Read = (String, std::result::Result<Trace, String>);

@@ -224,7 +224,7 @@ fn each_curve_that_is_not_used_has_its_reason_said() {
     for reason in [
         "curve 5000 was not used as an ECG: its type is RESP",
         "curve 5002 was not used as an ECG: it has 3 dimensions",
-        "curve 5004 was not used as an ECG: ",
+        "curve 5004 was not used as an ECG: 0 R-peaks are given, but at least two are needed",
         "curve 5006 was not used as an ECG: its DataValueRepresentation is missing",
         "curve 5008 was not used as an ECG: its times do not rise",
     ] {
