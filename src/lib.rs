@@ -260,6 +260,7 @@ pub mod phantom {
     pub mod noise;
     pub mod projector;
     mod runs;
+    mod sight;
     mod subjects;
     pub mod tree;
     pub mod tree_file;

@@ -9,7 +9,8 @@ use crate::phantom::degradations::{Chance, Degradations};
 use crate::phantom::noise::add_noise;
 use crate::phantom::projector::Projector;
 use crate::phantom::runs::{Shot, shots};
-use crate::phantom::subjects::{Moving, Patient, Placed, Pose, Reading, Subject, Thorax, Volumes};
+use crate::phantom::sight::Sight;
+use crate::phantom::subjects::{Moving, Patient, PatientFiles, Placed, Pose, Reading, Subject, Thorax, Volumes};
 use crate::phantom::tree::Tree;
 use crate::phantom::tree_file::{TREE, TreeFile};
 use crate::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
@@ -74,6 +75,8 @@ pub struct Anatomy {
     pub tree: PathBuf,
     /// CT in Hounsfield units.
     pub background: Option<PathBuf>,
+    /// Whether the middle of the tree is put at the isocentre, and the CT moved along.
+    pub centre: bool,
     /// C-arms.
     pub c_arms: CArmOptions,
     /// Vessel attenuation, 1/mm.
@@ -131,11 +134,17 @@ struct Shooting<'a> {
     volumes_every: Option<NonZeroU32>,
 }
 
-/// Makes a phantom dataset in the directory `out`.
+/// Makes a phantom dataset in the directory `out`. Returns warnings on what the views do not show.
 ///
 /// # Errors
-/// [`Error::Config`] for impossible options, [`Error::Data`] for unreadable anatomy, device errors.
-pub fn make(gpu: &Gpu, options: &PhantomOptions, out: &Path, mut progress: impl FnMut(&str, u64, u64)) -> Result<()> {
+/// [`Error::Config`] for impossible options, [`Error::Data`] for anatomy that is unreadable or outside every training view, device
+/// errors.
+pub fn make(
+    gpu: &Gpu,
+    options: &PhantomOptions,
+    out: &Path,
+    mut progress: impl FnMut(&str, u64, u64),
+) -> Result<Vec<String>> {
     if !(1..=200).contains(&options.phases) {
         return Err(Error::config("phases", options.phases, "is not in the accepted range, 1 to 200"));
     }
@@ -150,15 +159,17 @@ pub fn make(gpu: &Gpu, options: &PhantomOptions, out: &Path, mut progress: impl 
     shooting.check(out)?;
     let projector = Projector::new(gpu, options.size, options.size)?;
     progress("volumes", 0, 1);
-    let stage = match &options.anatomy {
-        None => procedural(options)?,
+    let (stage, warnings) = match &options.anatomy {
+        None => (procedural(options)?, Vec::new()),
         Some(anatomy) => from_files(options, anatomy)?,
     };
-    shoot(&projector, &stage, &shooting, out, progress)
+    shoot(&projector, &stage, &shooting, out, progress)?;
+    Ok(warnings)
 }
 
 /// Projects a user's volumes, one per phase, into a dataset in the directory `out`. At times between phases the nearest volume
-/// is used. If the patient breathes, the part that all volumes have in common is treated as static background.
+/// is used. If the patient breathes, the part that all volumes have in common is treated as static background. Returns warnings
+/// on what the views do not show.
 ///
 /// # Errors
 /// Errors of [`make`]; [`Error::Config`] also for degradations that need vessels where no vessel threshold is given.
@@ -167,7 +178,7 @@ pub fn project_volumes(
     options: &VolumeOptions,
     out: &Path,
     mut progress: impl FnMut(&str, u64, u64),
-) -> Result<()> {
+) -> Result<Vec<String>> {
     let shooting = Shooting {
         size: options.size,
         views: &options.views,
@@ -195,7 +206,9 @@ pub fn project_volumes(
         vessel_per_mm: options.vessel_per_mm,
     };
     let breathing = options.degradations.breathing.is_some();
-    let volumes = Volumes::read(&projector, &reading, breathing, |done| progress("volumes", done, total))?;
+    let sight = Sight::new(&c_arms[..options.views.training.len()], options.size)?;
+    let (volumes, warnings) =
+        Volumes::read(&projector, &reading, breathing, &sight, |done| progress("volumes", done, total))?;
     let stage = Stage {
         description: format!("projections of {} volumes", options.volumes.len()),
         depth_half_extent_mm: volumes.axial_radius_mm().min(largest_depth_mm(&c_arms)),
@@ -205,7 +218,8 @@ pub fn project_volumes(
         subject: Box::new(volumes),
         vessels_in_background: true,
     };
-    shoot(&projector, &stage, &shooting, out, progress)
+    shoot(&projector, &stage, &shooting, out, progress)?;
+    Ok(warnings)
 }
 
 /// Rejects degradations that need properties the volumes do not have.
@@ -473,15 +487,22 @@ fn procedural(options: &PhantomOptions) -> Result<Stage> {
     })
 }
 
-fn from_files(options: &PhantomOptions, anatomy: &Anatomy) -> Result<Stage> {
+fn from_files(options: &PhantomOptions, anatomy: &Anatomy) -> Result<(Stage, Vec<String>)> {
     let vessel_per_mm = anatomy.iodine_per_mm;
     if !(vessel_per_mm.is_finite() && vessel_per_mm > 0.0) {
         return Err(Error::config("iodine_per_mm", vessel_per_mm, "is not positive"));
     }
-    let patient = Patient::read(&anatomy.tree, anatomy.background.as_deref(), vessel_per_mm, options.phases)?;
     let c_arms = anatomy.c_arms.c_arms(&options.views, options.size)?;
+    let sight = Sight::new(&c_arms[..options.views.training.len()], options.size)?;
+    let files = PatientFiles {
+        tree: &anatomy.tree,
+        background: anatomy.background.as_deref(),
+        centre: anatomy.centre,
+        vessel_per_mm,
+    };
+    let (patient, warnings) = Patient::read(&files, options.phases, &sight)?;
     let radius = patient.axial_radius_mm().unwrap_or_else(|| widest_field_mm(&c_arms, options.size));
-    Ok(Stage {
+    let stage = Stage {
         description: format!("anatomy from {}", anatomy.tree.file_name().unwrap_or_default().to_string_lossy()),
         depth_half_extent_mm: radius.min(largest_depth_mm(&c_arms)),
         c_arms,
@@ -489,5 +510,6 @@ fn from_files(options: &PhantomOptions, anatomy: &Anatomy) -> Result<Stage> {
         phases: options.phases,
         subject: Box::new(patient),
         vessels_in_background: false,
-    })
+    };
+    Ok((stage, warnings))
 }

@@ -6,6 +6,7 @@ use crate::formats::volume::{Volume, VolumeHints};
 use crate::formats::volume_files;
 use crate::phantom::catheter;
 use crate::phantom::projector::{LoadedVolume, Projector};
+use crate::phantom::sight::{Seen, Sight, check_lengths, check_spacing};
 use crate::phantom::tree::{Bounds, Heart, Tree};
 use crate::phantom::tree_file::TreeFile;
 use crate::phantom::voxels::{self, Breath, Tissues};
@@ -168,6 +169,16 @@ fn write_vessels(directory: &Path, phase: u32, vessels: &Volume) -> Result<()> {
     Ok(nrrd::write(&truth_file(directory, phase), vessels, QUANTITY)?)
 }
 
+/// Files of a patient.
+pub(super) struct PatientFiles<'a> {
+    pub(super) tree: &'a Path,
+    /// CT in Hounsfield units.
+    pub(super) background: Option<&'a Path>,
+    /// Whether the middle of the tree is put at the isocentre.
+    pub(super) centre: bool,
+    pub(super) vessel_per_mm: f64,
+}
+
 /// A tree from a file, with a CT as its background if there is one.
 pub(super) struct Patient {
     tree: TreeFile,
@@ -177,15 +188,35 @@ pub(super) struct Patient {
 }
 
 impl Patient {
-    pub(super) fn read(tree: &Path, background: Option<&Path>, vessel_per_mm: f64, phases: u32) -> Result<Patient> {
-        let tree = TreeFile::read(tree)?;
+    /// Reads tree and CT. `centre` moves both so that the middle of the tree lies at the isocentre. Returns the warnings on what
+    /// the views will not show as well.
+    pub(super) fn read(files: &PatientFiles<'_>, phases: u32, sight: &Sight) -> Result<(Patient, Vec<String>)> {
+        let mut tree = TreeFile::read(files.tree)?;
+        check_lengths(files.tree, &tree, sight, VESSEL_VOXEL_MM)?;
+        let within = tree.bounds();
+        let shift_mm = if files.centre { -0.5 * (within.low_mm + within.high_mm) } else { DVec3::ZERO };
+        if files.centre {
+            tree = tree.moved(shift_mm);
+        }
+        let mut vessels = Seen::new(sight);
+        vessels.add_tree(&tree);
+        vessels.check(files.tree, "the vessels")?;
         let bounds = Bounds::over_the_beat(phases, |fraction| tree.at(fraction));
-        let still = background.map(|path| volume_files::read(path, &VolumeHints::default())).transpose()?;
-        let still = still.map(|mut volume| {
-            voxels::attenuation_from_hounsfield(&mut volume);
-            volume
-        });
-        Ok(Patient { tree, bounds, vessel_per_mm, still })
+        let still = files.background.map(|path| Self::background(path, shift_mm, sight)).transpose()?;
+        let patient = Patient { tree, bounds, vessel_per_mm: files.vessel_per_mm, still };
+        Ok((patient, vessels.missing("the vessels").into_iter().collect()))
+    }
+
+    /// Reads a CT. It is usually wider than the field of view, so parts of it that are not shown are not worth a warning.
+    fn background(path: &Path, shift_mm: DVec3, sight: &Sight) -> Result<Volume> {
+        let mut volume = volume_files::read(path, &VolumeHints::default())?;
+        volume.index_to_lps.translation += shift_mm;
+        check_spacing(path, &volume, sight)?;
+        voxels::attenuation_from_hounsfield(&mut volume);
+        let mut seen = Seen::new(sight);
+        seen.add_volume(&volume);
+        seen.check(path, "the voxels of the CT")?;
+        Ok(volume)
     }
 
     /// Largest axial distance of the CT's corners from the isocentre, mm; none without a CT.
@@ -276,30 +307,50 @@ pub(super) struct Volumes {
 }
 
 impl Volumes {
-    /// Reads all volumes. If `breathing`, the static part is separated from the beating part.
+    /// Reads all volumes. If `breathing`, the static part is separated from the beating part. Returns the warnings on what the
+    /// views will not show as well.
     pub(super) fn read(
         projector: &Projector,
         reading: &Reading<'_>,
         breathing: bool,
+        sight: &Sight,
         mut progress: impl FnMut(u64),
-    ) -> Result<Volumes> {
+    ) -> Result<(Volumes, Vec<String>)> {
         let still = if breathing { reading.minimum()? } else { None };
         let (mut moving, mut radius_mm) = (Vec::new(), 0f64);
+        let (mut all, mut bright) = (Seen::new(sight), Seen::new(sight));
         for (index, path) in reading.paths.iter().enumerate() {
             progress(index as u64);
             let mut volume = reading.volume(path)?;
+            check_spacing(path, &volume, sight)?;
+            all.add_volume(&volume);
             radius_mm = radius_mm.max(volume.axial_radius_mm());
             let vessels = reading.vessel_per_mm.map(|threshold| Volume {
                 values: volume.values.iter().map(|v| if f64::from(*v) >= threshold { *v } else { 0.0 }).collect(),
                 ..volume.clone()
             });
+            if let Some(vessels) = &vessels {
+                bright.add_volume(vessels);
+            }
             let vessels = vessels.map(|v| projector.load(v)).transpose()?.map(Arc::new);
             if let Some(still) = &still {
                 volume.values.iter_mut().zip(&still.values).for_each(|(v, min)| *v -= min);
             }
             moving.push((Arc::new(projector.load(volume)?), vessels));
         }
-        Ok(Volumes { still, moving, radius_mm })
+        let first = &reading.paths[0];
+        all.check(first, "the volumes")?;
+        let missing = match reading.vessel_per_mm {
+            Some(threshold) if bright.is_empty() => {
+                Some(format!("no voxel reaches the attenuation of vessels that was given, {threshold} per mm"))
+            }
+            Some(_) => {
+                bright.check(first, "the vessels")?;
+                bright.missing("the vessels")
+            }
+            None => all.missing("the volumes"),
+        };
+        Ok((Volumes { still, moving, radius_mm }, missing.into_iter().collect()))
     }
 
     pub(super) fn axial_radius_mm(&self) -> f64 {

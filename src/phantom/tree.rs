@@ -226,7 +226,8 @@ pub struct Bounds {
 }
 
 impl Bounds {
-    const EMPTY: Bounds = Bounds { low_mm: DVec3::INFINITY, high_mm: DVec3::NEG_INFINITY };
+    /// Box that contains nothing.
+    pub(super) const EMPTY: Bounds = Bounds { low_mm: DVec3::INFINITY, high_mm: DVec3::NEG_INFINITY };
 
     /// Smallest box that contains both.
     pub fn joined(self, other: Bounds) -> Bounds {

@@ -3,7 +3,7 @@
 use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::vtp::{self, ReadLines};
-use crate::phantom::tree::{Branch, Tree};
+use crate::phantom::tree::{Bounds, Branch, Tree};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -12,6 +12,12 @@ use std::path::{Path, PathBuf};
 pub const TREE: &str = "tree.json";
 /// Names of arrays of radii at points: the name VMTK and 3D Slicer use, and other common names.
 const RADII: [&str; 3] = ["MaximumInscribedSphereRadius", "Radius", "radius"];
+/// Largest accepted coordinate and radius, mm.
+const FARTHEST_MM: f64 = 1e4;
+/// Largest accepted length of all branches together, mm: lines are compared point by point.
+const LONGEST_MM: f64 = 1e6;
+/// Advice where a length is out of range.
+pub(super) const UNITS: &str = "lengths are mm; in micrometres they are 1000 times as large, in metres a thousandth";
 
 /// A tree over its beat, as stored in a file.
 #[derive(Debug, Serialize, Deserialize)]
@@ -143,6 +149,32 @@ impl TreeFile {
         Tree { branches: self.branches.iter().map(branch).collect() }
     }
 
+    /// Trees of the stored phases.
+    pub(super) fn stored(&self) -> impl Iterator<Item = Tree> {
+        let stored = self.points_mm.len();
+        (0..stored).map(move |phase| self.at(phase as f64 / stored as f64))
+    }
+
+    /// Bounding box over all stored phases, including radii.
+    pub(super) fn bounds(&self) -> Bounds {
+        self.stored().map(|tree| tree.bounds()).fold(Bounds::EMPTY, Bounds::joined)
+    }
+
+    /// Index and value of the largest radius, mm.
+    pub(super) fn widest_mm(&self) -> (usize, f64) {
+        let radii = self.radius_mm.iter().copied().enumerate();
+        radii.fold((0, 0.0), |widest, next| if next.1 > widest.1 { next } else { widest })
+    }
+
+    /// Returns the tree moved by `shift_mm` (LPS).
+    pub(super) fn moved(mut self, shift_mm: DVec3) -> TreeFile {
+        let ras = [-shift_mm.x, -shift_mm.y, shift_mm.z];
+        for point in self.points_mm.iter_mut().flatten() {
+            point.iter_mut().zip(ras).for_each(|(at, by)| *at += by);
+        }
+        self
+    }
+
     fn check(&self, path: &Path) -> Result<()> {
         let n = self.radius_mm.len();
         if self.points_mm.is_empty() || self.branches.is_empty() {
@@ -150,6 +182,10 @@ impl TreeFile {
         }
         if let Some(i) = self.radius_mm.iter().position(|r| !(r.is_finite() && *r > 0.0)) {
             return Err(Error::data(path, format!("radius_mm[{i}]"), "is not a positive length"));
+        }
+        if let Some(i) = self.radius_mm.iter().position(|r| *r > FARTHEST_MM) {
+            let problem = format!("{:e} is not the radius of a vessel in mm: {UNITS}", self.radius_mm[i]);
+            return Err(Error::data(path, format!("radius_mm[{i}]"), problem));
         }
         for (p, points) in self.points_mm.iter().enumerate() {
             if points.len() != n {
@@ -159,8 +195,9 @@ impl TreeFile {
                     format!("has {} points for {n} radii", points.len()),
                 ));
             }
-            if let Some(i) = points.iter().position(|x| x.iter().any(|v| !v.is_finite())) {
-                return Err(Error::data(path, format!("points_mm[{p}][{i}]"), "is not finite"));
+            if let Some(i) = points.iter().position(|x| x.iter().any(|v| v.is_nan() || v.abs() > FARTHEST_MM)) {
+                let problem = format!("{:?} is not a position in mm: {UNITS}", points[i]);
+                return Err(Error::data(path, format!("points_mm[{p}][{i}]"), problem));
             }
         }
         for (i, b) in self.branches.iter().enumerate() {
@@ -171,6 +208,17 @@ impl TreeFile {
                     "its range exceeds the point array or has fewer than 2 points",
                 ));
             }
+        }
+        let length = |points: &Vec<[f64; 3]>| -> f64 {
+            let of_branch = |b: &TreeBranch| {
+                let points = points[b.first..b.first + b.count].iter().map(|p| DVec3::from_array(*p));
+                points.clone().zip(points.skip(1)).map(|(a, b)| a.distance(b)).sum::<f64>()
+            };
+            self.branches.iter().map(of_branch).sum()
+        };
+        if let Some((p, long)) = self.points_mm.iter().map(length).enumerate().find(|(_, l)| *l > LONGEST_MM) {
+            let problem = format!("the branches are {long:.0} mm long, more than {LONGEST_MM:.0} mm together: {UNITS}");
+            return Err(Error::data(path, format!("points_mm[{p}]"), problem));
         }
         Ok(())
     }

@@ -159,10 +159,16 @@ pub fn attenuation_from_hounsfield(volume: &mut Volume) {
     }
 }
 
+/// Number of voxels along each axis of the grid that a tree within a box is drawn into.
+pub(super) fn grid_size(bounds: Bounds, spacing_mm: f64) -> [usize; 3] {
+    let (low, high) = (bounds.low_mm - 2.0 * spacing_mm, bounds.high_mm + 2.0 * spacing_mm);
+    ((high - low) / spacing_mm).ceil().as_usizevec3().to_array().map(|n| n.saturating_add(1))
+}
+
 /// Draws a tree into the voxels of a box: attenuation times filling inside, antialiased at the wall.
 pub fn vessels(tree: &Tree, bounds: Bounds, attenuation: f64, spacing_mm: f64) -> Volume {
-    let (low, high) = (bounds.low_mm - 2.0 * spacing_mm, bounds.high_mm + 2.0 * spacing_mm);
-    let size = ((high - low) / spacing_mm).ceil().as_usizevec3().to_array().map(|n| n + 1);
+    let low = bounds.low_mm - 2.0 * spacing_mm;
+    let size = grid_size(bounds, spacing_mm);
     let mut values = vec![0f32; size.iter().product()];
     for branch in &tree.branches {
         let points = &branch.points;

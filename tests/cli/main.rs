@@ -35,6 +35,7 @@ mod method_runs;
 mod motion;
 mod moving_runs;
 mod network_runs;
+mod positions;
 mod selftest;
 mod study;
 mod tree_files;

@@ -151,6 +151,7 @@ impl Files {
         let anatomy = Anatomy {
             tree: self.tree(),
             background: ct.then(|| self.directory.path().join("ct.nrrd")),
+            centre: false,
             c_arms: c_arms(),
             iodine_per_mm: IODINE,
         };

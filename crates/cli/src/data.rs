@@ -62,6 +62,10 @@ fn tell_of_times(layout: Layout, degradations: &Degradations) {
     }
 }
 
+fn warn(warnings: &[String]) {
+    warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
+}
+
 /// Makes a phantom.
 pub fn phantom(global: &GlobalOptions, args: &PhantomArgs) -> Result<()> {
     if args.tree.is_none() && !args.c_arm.is_default() {
@@ -81,13 +85,14 @@ pub fn phantom(global: &GlobalOptions, args: &PhantomArgs) -> Result<()> {
         anatomy: args.tree.as_ref().map(|tree| Anatomy {
             tree: tree.clone(),
             background: args.background.clone(),
+            centre: args.centre,
             c_arms: args.c_arm.options(),
             iodine_per_mm: args.iodine,
         }),
         volumes_every: (!args.no_volumes).then_some(args.volumes_every),
     };
     tell_of_times(options.layout, &options.degradations);
-    make(&gpu, &options, &args.out, bar())?;
+    warn(&make(&gpu, &options, &args.out, bar())?);
     out!("{}", args.out.display());
     global.close_device(&gpu)
 }
@@ -114,7 +119,7 @@ pub fn project(global: &GlobalOptions, args: &ProjectArgs) -> Result<()> {
         layout: args.layout,
     };
     tell_of_times(options.layout, &options.degradations);
-    project_volumes(&gpu, &options, &args.out, bar())?;
+    warn(&project_volumes(&gpu, &options, &args.out, bar())?);
     out!("{}", args.out.display());
     global.close_device(&gpu)
 }

@@ -44,6 +44,9 @@ pub struct PhantomArgs {
     /// Chest CT in Hounsfield units as background of the tree.
     #[arg(long, value_name = "CT", requires = "tree")]
     pub background: Option<PathBuf>,
+    /// Put the middle of the tree, over its beat, at the isocentre; the CT moves along.
+    #[arg(long, requires = "tree")]
+    pub centre: bool,
     /// C-arm with --tree.
     #[command(flatten)]
     pub c_arm: CArmArgs,

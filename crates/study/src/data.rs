@@ -129,6 +129,7 @@ impl PhantomSection {
         Ok(Some(Anatomy {
             tree: places.find(tree)?,
             background: self.background.as_deref().map(|path| places.find(path)).transpose()?,
+            centre: false,
             c_arms: CArmOptions {
                 sod_mm: vec![sod_mm],
                 sid_mm: vec![sid_mm],
