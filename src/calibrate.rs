@@ -48,7 +48,7 @@ const WELL_EXPLAINED: f64 = 0.96;
 /// the stated geometry.
 const LEFT_UNEXPLAINED: f64 = 0.75;
 /// Changes over the beat below this share of the images' range are rounding errors.
-const MIN_CHANGE: f64 = 1e-5;
+pub(crate) const MIN_CHANGE: f64 = 1e-5;
 /// Half side of the cube that represents the heart when corrections are compared, as a share of half the field of view.
 const HEART_SHARE: f64 = 0.5;
 
@@ -253,6 +253,7 @@ impl Calibrator<'_> {
             repeatability_px,
             tried,
             explained,
+            explained_by_chance: Some(silhouettes::explained_by_chance(self.observed, poses)),
             notes: self.notes,
         };
         calibration.describe();

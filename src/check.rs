@@ -3,18 +3,22 @@
 //!
 //! Views are compared by their changes over the beat ([`mod@agreement`]), which needs neither labels nor a reconstruction.
 //! When they disagree, each of the usual [`mistakes`] is undone in turn, and those after whose correction the views agree
-//! are named. No set of views can distinguish a patient from the mirrored patient.
+//! are named. No set of views can distinguish a patient from the mirrored patient. A view accuses others only where its images
+//! say enough; what they cannot say is reported as missing evidence ([`mod@evidence`]).
 
 pub mod agreement;
+mod evidence;
 pub mod mistakes;
+mod polarity;
 
 use crate::calibrate::observed::Observed;
+use crate::calibrate::pose::Poses;
 use crate::calibrate::profiles::Views;
+use crate::calibrate::silhouettes;
 use crate::error::{Error, Result};
-use crate::evidence::background::Background;
-use crate::evidence::series::Series;
 use crate::scan::dataset::Dataset;
 use agreement::{Agreement, Comparison, Sharpness, agreement};
+use evidence::Judged;
 use mistakes::{MISTAKES, Mistake, PhaseMistake, exchanged};
 use serde::Serialize;
 
@@ -31,6 +35,25 @@ const CUT_OFF: f64 = 0.05;
 /// Noise, as a share of the strongest change, above which thin vessels are lost.
 const NOISY: f64 = 0.2;
 
+/// Angle between two views, degrees, below which their common depth is hardly determined.
+const NARROW_DEG: f64 = 30.0;
+
+/// Outcome of a check.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Verdict {
+    /// The views show the same object.
+    Agree,
+    /// The views would agree, or show vessels as they should, without one of the usual mistakes.
+    Mistake,
+    /// The views do not show the same object, and none of the usual mistakes explains it.
+    Disagree,
+    /// Nothing changes over the beat in at least one view.
+    Blank,
+    /// The evidence is too little to tell whether the views show the same object.
+    Unknown,
+}
+
 /// Result for one view.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CheckedView {
@@ -40,8 +63,8 @@ pub struct CheckedView {
     pub angles_deg: Option<(f64, f64)>,
     /// Number of its phases.
     pub phases: usize,
-    /// Noise of a pixel, as a share of the strongest change.
-    pub noise: f64,
+    /// Noise of a pixel, as a share of the strongest change; `None` where nothing changes over the beat.
+    pub noise: Option<f64>,
     /// Root mean square, over the phases, of the wide motion other than that of vessels, as a share of the strongest change
     /// of narrow structures; `None` where there is none.
     pub wide_motion: Option<f64>,
@@ -52,13 +75,20 @@ pub struct CheckedView {
 /// Result for a dataset.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Check {
+    /// Outcome.
+    pub verdict: Verdict,
     /// Training views with at least two phases.
     pub views: Vec<CheckedView>,
     /// Agreement of the views; `None` where no two of them can be compared.
     pub agreement: Option<Agreement>,
+    /// Share of the vessel pixels of a view for which all other views show a vessel on the ray, and the share by chance, with the
+    /// vessels of the view displaced by a seventh of the image.
+    pub explained: [f64; 2],
     /// Advice on the mistakes that explain a disagreement, likeliest first: one of them was made. Empty when the data are
     /// sound, or wrong in a way that is not among the usual ones.
     pub mistakes: Vec<String>,
+    /// Evidence that is missing, by view.
+    pub missing: Vec<String>,
     /// Further points to look at.
     pub warnings: Vec<String>,
 }
@@ -66,7 +96,37 @@ pub struct Check {
 impl Check {
     /// Tells whether the views agree and no mistake was found.
     pub fn sound(&self) -> bool {
-        self.mistakes.is_empty() && self.agreement.as_ref().is_some_and(|a| a.coarse <= DISAGREES)
+        self.verdict == Verdict::Agree
+    }
+
+    /// Tells whether something is wrong with the data; missing evidence is no fault.
+    pub fn faulty(&self) -> bool {
+        !matches!(self.verdict, Verdict::Agree | Verdict::Unknown)
+    }
+
+    /// Describes the outcome in a sentence without a capital letter and a full stop.
+    pub fn conclusion(&self) -> String {
+        match (self.verdict, self.mistakes.first()) {
+            (Verdict::Mistake, Some(mistake)) => {
+                format!("the views agree once one mistake is corrected: {mistake}")
+            }
+            (Verdict::Agree, _) => "the views show the same object".into(),
+            (Verdict::Blank, _) => "nothing changes over the beat in a view".into(),
+            (Verdict::Unknown, _) => "the evidence is too little to tell whether the views show the same object".into(),
+            (Verdict::Disagree | Verdict::Mistake, _) => "the views do not show the same object".into(),
+        }
+    }
+
+    /// Describes how much the views agree, and how much they would by chance; `None` where they cannot be compared.
+    pub fn in_numbers(&self) -> Option<String> {
+        let agreement = self.agreement.as_ref()?;
+        let [explained, by_chance] = self.explained.map(|share| 100.0 * share);
+        Some(format!(
+            "{:.0} % of the moving contrast differs between two views (0 for the same object, 100 for unrelated images); all \
+             other views show a vessel for {explained:.0} % of a view's vessel pixels, and for {by_chance:.0} % by chance, with \
+             the vessels of the view displaced",
+            100.0 * agreement.coarse
+        ))
     }
 }
 
@@ -92,41 +152,82 @@ pub fn check(dataset: &Dataset) -> Result<Check> {
         );
         return Err(Error::config("dataset", dataset.path.display(), problem));
     }
-    let (series, stated) = (Series::of(dataset), agreement(&observed.fine));
-    let views: Vec<CheckedView> =
-        (0..observed.views.len()).map(|v| checked_view(dataset, &observed, v, &series[v])).collect();
-    let mistakes = stated.as_ref().map_or(Vec::new(), |stated| {
-        let inverted = darkens(&observed.fine) < 0.0;
-        named(stated, &explanations(dataset, &observed, inverted), inverted)
-    });
+    Ok(checked(dataset, &observed, true))
+}
+
+/// Compares the views of a dataset without looking for the mistakes that explain a disagreement, which takes much longer; only
+/// whether the logarithm is missing or was taken twice is looked for. Returns `None` when fewer than two training views have two
+/// phases.
+pub fn compare(dataset: &Dataset) -> Option<Check> {
+    let observed = Observed::new(dataset);
+    (observed.views.len() >= 2).then(|| checked(dataset, &observed, false))
+}
+
+fn checked(dataset: &Dataset, observed: &Observed, thoroughly: bool) -> Check {
+    let judged = Judged::new(observed);
+    let stated = agreement(&observed.fine, |pair| judged.takes(pair));
+    let inverted = polarity::is_inverted(dataset);
+    let mistakes = match &stated {
+        Some(stated) if thoroughly || inverted => {
+            named(stated, &explanations(dataset, observed, &judged, inverted), inverted)
+        }
+        _ => Vec::new(),
+    };
+    let views: Vec<CheckedView> = (0..observed.views.len()).map(|slot| checked_view(dataset, observed, slot)).collect();
     let mut warnings = view_warnings(&views);
+    warnings.extend(two_views(dataset, observed));
+    let differ = stated.as_ref().is_some_and(|stated| stated.coarse > DISAGREES);
+    let verdict = match &stated {
+        _ if !judged.blank(observed).is_empty() => Verdict::Blank,
+        _ if !mistakes.is_empty() => Verdict::Mistake,
+        None => Verdict::Unknown,
+        Some(_) if !differ => Verdict::Agree,
+        Some(_) if judged.firmly => Verdict::Disagree,
+        Some(_) => Verdict::Unknown,
+    };
     match &stated {
-        None => warnings
+        None if observed.fine.pairs.is_empty() => warnings
             .push("no two views can be compared: all views look from the same side or from opposite sides".into()),
-        Some(stated) if mistakes.is_empty() && stated.coarse > DISAGREES => warnings.push(format!(
-            "the views disagree ({:.0} % of the moving contrast differs between two views), and none of the usual \
-             mistakes explains it: compare geometry, phases and order of the images with their source",
-            100.0 * stated.coarse
+        Some(stated) if verdict == Verdict::Disagree => warnings.push(format!(
+            "the views disagree ({:.0} % of the moving contrast differs between two views){}: compare geometry, phases and order \
+             of the images with their source",
+            100.0 * stated.coarse,
+            if thoroughly { ", and none of the usual mistakes explains it" } else { "" }
         )),
         _ => (),
     }
-    Ok(Check { views, agreement: stated, mistakes, warnings })
+    let poses = Poses::stated(observed.views.len(), observed.n_phases());
+    let explained = [silhouettes::explained, silhouettes::explained_by_chance].map(|share| share(observed, &poses));
+    let missing = judged.missing(dataset, observed);
+    Check { verdict, views, agreement: stated, explained, mistakes, missing, warnings }
 }
 
-fn checked_view(dataset: &Dataset, observed: &Observed, v: usize, series: &Series) -> CheckedView {
-    let background = Background::new(series);
+fn checked_view(dataset: &Dataset, observed: &Observed, slot: usize) -> CheckedView {
     CheckedView {
-        view: observed.views[v],
-        angles_deg: dataset.views[observed.views[v]].geometry.angles_deg(),
-        phases: series.seen().count(),
-        noise: median(&background.noise.values) / f64::from(background.strongest).max(f64::MIN_POSITIVE),
-        wide_motion: background.drift.size().map(f64::from),
-        at_edges: observed.at_border[v],
+        view: observed.views[slot],
+        angles_deg: dataset.views[observed.views[slot]].geometry.angles_deg(),
+        phases: observed.phases_of(slot),
+        noise: Some(observed.noise[slot]).filter(|noise| noise.is_finite()),
+        wide_motion: observed.wide_motion[slot],
+        at_edges: observed.at_border[slot],
     }
 }
 
-fn median(values: &[f32]) -> f64 {
-    f64::from(crate::raster::percentile(values, 0.5))
+/// Returns a warning where only two views show what moves, with the angle between them.
+fn two_views(dataset: &Dataset, observed: &Observed) -> Option<String> {
+    let [a, b] = observed.views[..] else { return None };
+    let between = dataset.views[a].rays.axis().angle_between(dataset.views[b].rays.axis()).to_degrees();
+    let apart = between.min(180.0 - between);
+    let narrow = if apart < NARROW_DEG {
+        "At so small an angle, depth is hardly determined at all; two views should be 60 to 90 degrees apart"
+    } else {
+        "A third view resolves most of it"
+    };
+    Some(format!(
+        "only two views show what moves, {a} and {b}, {apart:.0} degrees apart. Depth is ambiguous: wherever vessels of both views \
+         lie in one plane through both sources, each may belong to each, so branches that do not exist and gaps in those that do \
+         are to be expected, which fit both views as well as the truth. {narrow}"
+    ))
 }
 
 fn view_warnings(views: &[CheckedView]) -> Vec<String> {
@@ -139,8 +240,8 @@ fn view_warnings(views: &[CheckedView]) -> Vec<String> {
                 v.view
             ));
         }
-        if v.noise > NOISY {
-            let share = 100.0 * v.noise;
+        if let Some(noise) = v.noise.filter(|noise| *noise > NOISY) {
+            let share = 100.0 * noise;
             warnings.push(format!(
                 "view {}: the noise is {share:.0} % of the strongest vessel, so thin vessels will be lost",
                 v.view
@@ -156,25 +257,13 @@ fn view_warnings(views: &[CheckedView]) -> Vec<String> {
     warnings
 }
 
-/// Third moment of the changes over time. It is positive, since vessels darken few pixels strongly at a time.
-fn darkens(views: &Views) -> f64 {
-    let mut moment = 0.0;
-    for view in &views.views {
-        let seen: Vec<&Vec<f32>> = view.phases.iter().flatten().collect();
-        for pixel in 0..view.pixels.len() {
-            let mean = seen.iter().map(|p| f64::from(p[pixel])).sum::<f64>() / seen.len() as f64;
-            moment += seen.iter().map(|p| (f64::from(p[pixel]) - mean).powi(3)).sum::<f64>();
-        }
-    }
-    moment
-}
-
 /// Mistakes that make vessels brighten instead of darken.
 const INVERTING: [Mistake; 2] = [Mistake::LogTwice, Mistake::LogMissing];
 
-fn explanations(dataset: &Dataset, observed: &Observed, inverted: bool) -> Vec<Explanation> {
+fn explanations(dataset: &Dataset, observed: &Observed, judged: &Judged, inverted: bool) -> Vec<Explanation> {
     let mut all = Vec::new();
     let mut consider = |advice: String, views: Views| {
+        let views = judged.only(views);
         if !views.pairs.is_empty() {
             let fine = Comparison::of(&views, Sharpness::Fine).residual();
             all.push(Explanation { advice, views, fine });
@@ -197,9 +286,10 @@ fn explanations(dataset: &Dataset, observed: &Observed, inverted: bool) -> Vec<E
             }
         }
     }
-    let stated = Comparison::of(&observed.fine, Sharpness::Fine);
+    let judged = judged.only(observed.fine.clone());
+    let stated = Comparison::of(&judged, Sharpness::Fine);
     all.extend(PhaseMistake::all(observed.views.len(), observed.fine.n_phases).map(|mistake| {
-        let views = mistake.undone(&observed.fine);
+        let views = mistake.undone(&judged);
         let fine = stated.after_change(&views, mistake.view).residual();
         Explanation { advice: advice_on_phases(mistake, observed.views[mistake.view]), views, fine }
     }));

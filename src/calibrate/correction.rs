@@ -67,6 +67,9 @@ pub struct Calibration {
     /// Share of the vessel pixels for which all other views show a vessel on the ray, to within a pixel: before and after
     /// the correction.
     pub explained: [f64; 2],
+    /// Share that would be explained by chance, with the vessels of a view displaced; `None` where it was not determined.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub explained_by_chance: Option<f64>,
     /// Notes on what was done and why.
     pub notes: Vec<String>,
 }
@@ -82,6 +85,7 @@ impl Calibration {
             repeatability_px: None,
             tried: Vec::new(),
             explained: [0.0; 2],
+            explained_by_chance: None,
             notes: note.into_iter().collect(),
         }
     }

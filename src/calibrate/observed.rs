@@ -4,7 +4,7 @@ use crate::calibrate::pose::StatedView;
 use crate::calibrate::profiles::{Moving, Views};
 use crate::evidence::ratios::ViewEvidence;
 use crate::evidence::series::Series;
-use crate::raster::widened;
+use crate::raster::{percentile, widened};
 use crate::scan::dataset::{Dataset, Frame, View};
 use glam::DVec3;
 use rayon::prelude::*;
@@ -50,6 +50,12 @@ pub struct Observed {
     pub sizes: Vec<[usize; 2]>,
     /// Strongest change over the beat of any view, as a share of the range of its line integrals.
     pub change: f64,
+    /// Strongest change over the beat of each view, as a share of the range of its line integrals.
+    pub changes: Vec<f64>,
+    /// Median noise of each view's binned pixels, as a share of its strongest change; infinite where nothing changes.
+    pub noise: Vec<f64>,
+    /// Size of the wide motion that was removed from each view, as a share of the strongest change.
+    pub wide_motion: Vec<Option<f64>>,
     /// Share of each view's change that lies at the border of its images.
     pub at_border: Vec<f64>,
 }
@@ -78,6 +84,11 @@ fn factor(dataset: &Dataset) -> usize {
     let sides = || dataset.training_views().into_iter().flat_map(|view| dataset.views[view].size);
     let (min, max) = (sides().min().unwrap_or(0), sides().max().unwrap_or(0));
     ((max as f64 / SIDE as f64).round() as usize).min(min / MIN_SIDE).max(1)
+}
+
+/// Returns the training images of each view with at least two phases, binned as for [`Observed`].
+pub(crate) fn binned_series(dataset: &Dataset) -> Vec<Series> {
+    Series::of(&coarsened(dataset, factor(dataset)))
 }
 
 /// Bins the training frames.
@@ -117,6 +128,9 @@ struct ObservedView {
     /// Pixels that show the patient.
     visible: Vec<bool>,
     noise: Vec<f32>,
+    /// Median noise as a share of the strongest change.
+    noise_share: f64,
+    wide_motion: Option<f64>,
     change: f64,
     at_border: f64,
 }
@@ -154,8 +168,25 @@ impl ObservedView {
         let values = series.seen().flat_map(|image| &image.values);
         let [min, max] = values.fold([f32::MAX, f32::MIN], |[l, m], v| [l.min(*v), m.max(*v)]);
         let change = f64::from(evidence.background.strongest) / f64::from(max - min).max(f64::MIN_POSITIVE);
+        let strongest = f64::from(evidence.background.strongest);
+        let wide_motion = evidence.background.drift.size().map(f64::from);
         let noise = evidence.background.noise.values;
-        let mut seen = ObservedView { stand, mask, wide_mask, above, shown, visible, noise, change, at_border: 0.0 };
+        let typical = f64::from(percentile(&noise, 0.5));
+        let noise_share = if strongest > 0.0 { typical / strongest } else { f64::INFINITY };
+        let at_border = 0.0;
+        let mut seen = ObservedView {
+            stand,
+            mask,
+            wide_mask,
+            above,
+            shown,
+            visible,
+            noise,
+            noise_share,
+            wide_motion,
+            change,
+            at_border,
+        };
         seen.at_border = seen.share_at_border(&border(&seen.visible, [data.width, data.height]));
         seen
     }
@@ -201,6 +232,9 @@ impl Observed {
             coarse: Views::new(seen.iter().map(positive).collect(), n_phases),
             fine: Views::new(seen.iter().map(signed).collect(), n_phases),
             change: seen.iter().map(|s| s.change).fold(0.0, f64::max),
+            changes: seen.iter().map(|s| s.change).collect(),
+            noise: seen.iter().map(|s| s.noise_share).collect(),
+            wide_motion: seen.iter().map(|s| s.wide_motion).collect(),
             at_border: seen.iter().map(|s| s.at_border).collect(),
             sizes: series.iter().map(|s| data.views[s.view].size).collect(),
             stands: seen.iter().map(|s| s.stand.clone()).collect(),
@@ -231,6 +265,11 @@ impl Observed {
         let shifts = |view: &usize| (0..self.n_phases()).map(|t| shift(*view, t)).collect();
         let heart = self.views.iter().map(shifts).collect();
         (other, heart)
+    }
+
+    /// Number of phases that a view has, by its index among the observed ones.
+    pub fn phases_of(&self, slot: usize) -> usize {
+        self.fine.views[slot].phases.iter().flatten().count()
     }
 
     /// Number of cardiac phases.

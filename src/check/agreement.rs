@@ -31,12 +31,17 @@ pub struct PairAgreement {
     pub views: [usize; 2],
     /// Squared difference of their profiles, as a share of their squares: 0 for one object, about 1 for two unrelated ones.
     pub residual: f64,
+    /// Share of the squares of their profiles that varies over the phases. Vessels that move within the planes through both
+    /// sources change nothing in the profiles, whose difference then says nothing.
+    pub varies: f64,
+    /// Whether the verdict rests on the pair: both views have enough evidence, or no two views have.
+    pub judged: bool,
 }
 
 /// Agreement of all views.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Agreement {
-    /// Squared difference of fine profiles over all pairs, as a share of their squares.
+    /// Squared difference of fine profiles over the judged pairs, as a share of their squares.
     pub fine: f64,
     /// Squared difference, as a share, with profiles so blurred that an error of geometry hardly matters.
     pub coarse: f64,
@@ -95,6 +100,11 @@ impl Comparison {
     pub fn residual(&self) -> f64 {
         share(self.by_pair.iter().copied())
     }
+
+    /// Squared difference of the profiles of some pairs, as a share of their squares.
+    fn residual_of(&self, judged: &[bool]) -> f64 {
+        share(self.by_pair.iter().zip(judged).filter(|(_, judged)| **judged).map(|(parts, _)| *parts))
+    }
 }
 
 fn compare(views: &Views, pair: Pair, look: Sharpness) -> SquareSums {
@@ -103,16 +113,29 @@ fn compare(views: &Views, pair: Pair, look: Sharpness) -> SquareSums {
     parts(&views.profiles(pair, &poses, &phases, &look.blur()))
 }
 
-/// Agreement of views over the pairs that constrain each other; `None` when there is no such pair.
-pub fn agreement(views: &Views) -> Option<Agreement> {
+/// Share of the squares of a pair's profiles that varies over the phases both views have.
+pub(super) fn variation(views: &Views, pair: Pair) -> f64 {
+    let poses = Poses::stated(views.views.len(), views.n_phases);
+    let phases: Vec<usize> = (0..views.n_phases).collect();
+    let profiles = views.profiles(pair, &poses, &phases, &Sharpness::Fine.blur());
+    let all = profiles.iter().flat_map(|at| &at.profiles).flat_map(|profile| &profile.value);
+    let squares: f64 = all.map(|value| value * value).sum();
+    if squares > 0.0 { parts(&profiles).1 / squares } else { 0.0 }
+}
+
+/// Agreement of views over the pairs that constrain each other and are judged; `None` when there is no such pair.
+pub fn agreement(views: &Views, judge: impl Fn(&Pair) -> bool) -> Option<Agreement> {
+    let judged: Vec<bool> = views.pairs.iter().map(judge).collect();
     let fine = Comparison::of(views, Sharpness::Fine);
-    let pair = |(pair, parts): (&Pair, &SquareSums)| PairAgreement {
+    let pair = |((pair, parts), judged): ((&Pair, &SquareSums), &bool)| PairAgreement {
         views: pair.views,
         residual: share(std::iter::once(*parts)),
+        varies: variation(views, *pair),
+        judged: *judged,
     };
-    (!views.pairs.is_empty()).then(|| Agreement {
-        fine: fine.residual(),
-        coarse: Comparison::of(views, Sharpness::Coarse).residual(),
-        pairs: views.pairs.iter().zip(&fine.by_pair).map(pair).collect(),
+    judged.contains(&true).then(|| Agreement {
+        fine: fine.residual_of(&judged),
+        coarse: Comparison::of(views, Sharpness::Coarse).residual_of(&judged),
+        pairs: views.pairs.iter().zip(&fine.by_pair).zip(&judged).map(pair).collect(),
     })
 }

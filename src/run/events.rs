@@ -1,5 +1,6 @@
 //! Events that a run reports to its observer.
 
+use crate::check::Check;
 use crate::fitting::losses::StepLoss;
 use crate::gpu::record::PassTime;
 use serde::Serialize;
@@ -21,6 +22,17 @@ pub enum Event {
         parameters: usize,
         /// Decisions about data and device.
         notes: Vec<String>,
+    },
+    /// Comparison of the training views as stated, which a new run makes where two of them show two phases. It follows
+    /// [`Event::Started`], or comes alone where the run cannot start.
+    Checked {
+        /// Iterations done, 0.
+        step: u32,
+        /// Outcome in words.
+        conclusion: String,
+        /// The comparison.
+        #[serde(flatten)]
+        check: Box<Check>,
     },
     /// Preparation before the first iteration: Gaussians are placed and followed through the beat; not a line of
     /// `metrics.jsonl`.

@@ -7,6 +7,7 @@ use crate::calibrate::calibrate;
 use crate::calibrate::choose::Correction;
 use crate::calibrate::correction::Calibration;
 use crate::calibrate::gauge::RigidMotion;
+use crate::check;
 use crate::checkpoint::{self, Checkpoint};
 use crate::config::Config;
 use crate::error::{Error, Result};
@@ -30,6 +31,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
 use std::time::Instant;
 
+/// File of a run's configuration, in the run directory.
+pub const CONFIG: &str = "config.toml";
 /// Losses are written and reported once per this many iterations.
 const REPORT_EVERY: u32 = 10;
 
@@ -63,6 +66,12 @@ pub fn reconstruct(
     for directory in [options.run, &options.run.join("report")] {
         files::remove_partial(directory);
     }
+    if !options.resume {
+        // A run that is killed before its first checkpoint is started over with its own configuration.
+        files::create_directory(options.run)?;
+        files::write_atomic(&options.run.join(CONFIG), config.to_toml()?.as_bytes())?;
+    }
+    let checked = if options.resume { None } else { checked(dataset) };
     let Calibrated { dataset, carried, calibration } = calibrated(config, dataset, options)?;
     let dataset = &dataset;
     let trainer = if options.resume {
@@ -70,14 +79,15 @@ pub fn reconstruct(
         let plan = Plan::new(&saved.model.config, dataset)?.in_scene(saved.model.scene.clone());
         Trainer::resume(gpu, plan, dataset, options.tuning.clone(), &saved)?
     } else {
-        let plan = Plan::new(config, dataset)?;
+        // What is wrong with the views is often the reason why there is nothing to plan.
+        let plan = Plan::new(config, dataset).inspect_err(|_| checked.iter().for_each(|event| observe(event)))?;
         if let Some(hull) = &plan.hull {
             hull_pictures::write(&options.run.join("report"), dataset, hull)?;
         }
         Trainer::new(gpu, plan, dataset, options.tuning.clone())?
     };
     let config = trainer.plan().config.clone();
-    files::write_atomic(&options.run.join("config.toml"), config.to_toml()?.as_bytes())?;
+    files::write_atomic(&options.run.join(CONFIG), config.to_toml()?.as_bytes())?;
     let mut log = MetricsLog::open(&options.run.join("metrics.jsonl"), trainer.step())?;
     let mut tell = |event: Event| -> Result<()> {
         log.write(&event)?;
@@ -103,6 +113,7 @@ pub fn reconstruct(
         parameters: trainer.plan().params.len,
         notes,
     })?;
+    checked.map_or(Ok(()), &mut tell)?;
     let mut training = Training::new(trainer);
     let begin = Instant::now();
     let worker = SnapshotWorker {
@@ -124,6 +135,12 @@ pub fn reconstruct(
     })
 }
 
+/// Compares the views; `None` where too few of them show what moves.
+fn checked(dataset: &Dataset) -> Option<Event> {
+    let check = check::compare(dataset)?;
+    Some(Event::Checked { step: 0, conclusion: check.conclusion(), check: Box::new(check) })
+}
+
 /// Dataset and calibration of a run.
 struct Calibrated {
     /// Dataset with the corrected geometry; unseen images lie where the reconstruction has them.
@@ -138,7 +155,6 @@ fn calibrated(config: &Config, dataset: &Dataset, options: &RunOptions<'_>) -> R
     let calibration = if options.resume {
         Calibration::read(options.run)?.unwrap_or_else(|| Calibration::none(None))
     } else {
-        files::create_directory(options.run)?;
         let calibration = calibrate(dataset, config)?;
         calibration.write(options.run)?;
         calibration

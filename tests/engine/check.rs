@@ -1,9 +1,15 @@
 //! Datasets with one of the usual mistakes are distinguished from sound ones. The mistakes are made here by independent
 //! loops.
 
+use crate::common::gpu;
 use glam::DVec3;
-use nertca_vk::check::{Check, check};
+use nertca_vk::check::{Check, Verdict, check, compare};
+use nertca_vk::config::{Config, Preset};
 use nertca_vk::geometry::{CArm, Geometry};
+use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
+use nertca_vk::phantom::degradations::Degradations;
+use nertca_vk::phantom::views::ViewAngles;
+use nertca_vk::plan::Plan;
 use nertca_vk::random::{STREAM_PHOTON, normal, uniform01};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use std::f64::consts::TAU;
@@ -13,17 +19,31 @@ const SIZE: usize = 100;
 
 /// Imperfections that are no mistakes.
 #[derive(Debug, Clone, Copy, Default)]
-struct Flaws {
-    seed: u32,
+pub(crate) struct Flaws {
+    pub(crate) seed: u32,
     /// Standard deviation of the stated angles' errors.
-    angle_deg: f64,
+    pub(crate) angle_deg: f64,
     /// Standard deviation of a pixel's noise; the strongest vessel has about 0.5.
-    noise: f64,
+    pub(crate) noise: f64,
+}
+
+/// Angiograms over a regular beat, see [`angiograms_at`].
+fn angiograms(n_views: usize, flaws: Flaws) -> Dataset {
+    let moments: Vec<_> = (0..PHASES).map(|phase| Some(f64::from(phase) / f64::from(PHASES))).collect();
+    angiograms_at(n_views, flaws, &moments)
 }
 
 /// Angiograms of a beating vessel made of Gaussian blobs, whose line integrals are known exactly, in front of a smooth body.
-fn angiograms(n_views: usize, flaws: Flaws) -> Dataset {
+/// `moments` are the fractions of the beat at the phases; a phase without one shows no vessel.
+pub(crate) fn angiograms_at(n_views: usize, flaws: Flaws, moments: &[Option<f64>]) -> Dataset {
     let angles = [(-30.0, 25.0), (40.0, 20.0), (-45.0, -20.0), (5.0, -30.0)];
+    let vessels = moments.iter().map(|moment| moment.map_or(Vec::new(), |moment| blobs(flaws.seed, moment)));
+    angiograms_of(&angles[..n_views], flaws, &vessels.collect::<Vec<_>>())
+}
+
+/// Angiograms of the blobs at each phase, from views at the given angles.
+fn angiograms_of(angles: &[(f64, f64)], flaws: Flaws, vessels: &[Vec<(DVec3, f64)>]) -> Dataset {
+    let (n_views, n_phases) = (angles.len(), vessels.len() as u32);
     let view = |v: usize, error: f64| {
         let off = |k: u32| error * normal(flaws.seed, STREAM_PHOTON, v as u32, k);
         let geometry = Geometry::CArm(CArm {
@@ -40,15 +60,14 @@ fn angiograms(n_views: usize, flaws: Flaws) -> Dataset {
     let mut frames = Vec::new();
     for v in 0..n_views {
         let rays = view(v, 0.0).rays;
-        for phase in 0..PHASES {
-            let blobs = blobs(flaws.seed, f64::from(phase) / f64::from(PHASES));
+        for (phase, blobs) in (0..).zip(vessels) {
             let integral = |p: usize| {
                 let (anchor, direction) = rays.pixel((p % SIZE) as f64, (p / SIZE) as f64);
                 let d = direction.normalize();
                 let past = |x: DVec3| (x - anchor).cross(d).length_squared();
                 let vessel: f64 = blobs.iter().map(|(x, r)| 12.0 * r * (-past(*x) / (2.0 * r * r)).exp()).sum();
                 let body = 1.5 * (-past(DVec3::new(0.2, 0.45, 0.5)) / 0.72).exp() + 0.6;
-                let noise = normal(flaws.seed, STREAM_PHOTON, 100 + v as u32 * PHASES + phase, p as u32);
+                let noise = normal(flaws.seed, STREAM_PHOTON, 100 + v as u32 * n_phases + phase, p as u32);
                 (body + vessel + flaws.noise * noise) as f32
             };
             frames.push(Frame {
@@ -70,7 +89,7 @@ fn angiograms(n_views: usize, flaws: Flaws) -> Dataset {
         frames,
         width: SIZE,
         height: SIZE,
-        n_phases: PHASES,
+        n_phases,
         depth_range: (-1.0, 1.0),
         hidden: Default::default(),
         vessel_attenuation: None,
@@ -79,7 +98,7 @@ fn angiograms(n_views: usize, flaws: Flaws) -> Dataset {
 }
 
 /// Centres and radii of a vessel at a moment of the beat, 100 mm: fast and strong contraction, slow relaxation.
-fn blobs(seed: u32, moment: f64) -> Vec<(DVec3, f64)> {
+pub(crate) fn blobs(seed: u32, moment: f64) -> Vec<(DVec3, f64)> {
     let of = |k: u32| uniform01(seed, STREAM_PHOTON, 7, k);
     let beat = if moment < 0.35 { (TAU * moment / 1.4).sin() } else { (TAU * (1.0 - moment) / 2.6).sin() };
     let shrink = 1.0 - 0.22 * beat;
@@ -98,7 +117,8 @@ fn blobs(seed: u32, moment: f64) -> Vec<(DVec3, f64)> {
 
 fn told(dataset: &Dataset) -> Check {
     let found = check(dataset).unwrap();
-    println!("{:?} {:?}", found.agreement.as_ref().map(|a| (a.fine, a.coarse)), found.mistakes);
+    let shares = found.agreement.as_ref().map(|a| (a.fine, a.coarse));
+    println!("{:?} {shares:?} {:?} {:?}", found.verdict, found.explained, found.mistakes);
     found
 }
 
@@ -191,6 +211,114 @@ fn views_that_have_nothing_to_do_with_each_other_are_told() {
     let found = told(&mixed);
     assert!(!found.sound() && found.mistakes.is_empty(), "{found:?}");
     assert!(found.warnings.iter().any(|w| w.contains("none of the usual mistakes")), "{found:?}");
+}
+
+/// A procedural phantom of six phases, in which the heart moves as well as the vessels.
+fn phantom_of_six_phases() -> Dataset {
+    let options = PhantomOptions {
+        setting: Setting::Xcat,
+        size: 100,
+        phases: 6,
+        views: ViewAngles::published(4).unwrap(),
+        seed: 1,
+        degradations: Degradations::default(),
+        layout: Layout::Native,
+        anatomy: None,
+        volumes_every: None,
+    };
+    let directory = tempfile::tempdir().unwrap();
+    let data = directory.path().join("data");
+    make(&gpu(), &options, &data, |_, _, _| ()).unwrap();
+    Dataset::open(&data).unwrap()
+}
+
+#[test]
+fn a_view_of_few_phases_is_missing_evidence() {
+    let whole = phantom_of_six_phases();
+    assert_eq!(told(&whole).missing, Vec::<String>::new());
+    for kept in [&[0, 3][..], &[0, 2, 4], &[0, 1, 2]] {
+        let mut few = whole.clone();
+        few.frames.retain(|f| f.view != 1 || kept.contains(&f.phase));
+        let found = told(&few);
+        assert_eq!((found.verdict, found.mistakes.len()), (Verdict::Agree, 0), "{kept:?}: {found:?}");
+        let [missing] = &found.missing[..] else { panic!("{kept:?}: {:?}", found.missing) };
+        let said = format!("view 1: {} of 6 phases", kept.len());
+        assert!(missing.starts_with(&said), "{kept:?}: {missing}");
+        let pairs = &found.agreement.unwrap().pairs;
+        assert!(pairs.iter().all(|pair| pair.judged != pair.views.contains(&1)), "{kept:?}: {pairs:?}");
+    }
+    // The other views still accuse each other.
+    let mut wrong = whole;
+    wrong.frames.retain(|f| f.view != 1 || f.phase < 2);
+    wrong.frames.iter_mut().filter(|f| f.view == 2).for_each(|f| f.integrals.reverse());
+    assert!(told(&wrong).faulty());
+}
+
+#[test]
+fn a_blank_view_is_named() {
+    let mut blank = angiograms(4, Flaws { seed: 2, ..Flaws::default() });
+    blank.frames.iter_mut().filter(|f| f.view == 2).for_each(|f| f.integrals.fill(1.5));
+    let found = told(&blank);
+    assert_eq!(found.verdict, Verdict::Blank);
+    assert!(found.missing.iter().any(|m| m.starts_with("view 2: nothing changes")), "{:?}", found.missing);
+    assert_eq!(found.views[2].noise, None);
+    assert!(found.views.iter().filter_map(|v| v.noise).all(|noise| noise < 1.0), "{:?}", found.views);
+    let refusal = Plan::new(&Config::preset(Preset::Fast), &blank).err().expect("nothing to fit").to_string();
+    assert!(refusal.contains("[2]") && refusal.contains("nothing changes"), "{refusal}");
+}
+
+#[test]
+fn vessels_that_stay_longer_than_they_are_away_are_not_inverted() {
+    let flaws = Flaws { seed: 3, ..Flaws::default() };
+    for moments in [&[Some(0.0), Some(0.0), None][..], &[Some(0.0), Some(0.05), None], &[Some(0.0), None]] {
+        // Integrals around .9 look like intensities, too.
+        for (scale, offset) in [(1.0, 0.0), (0.1, 0.8)] {
+            let mut few = angiograms_at(4, flaws, moments);
+            few.frames.iter_mut().flat_map(|f| &mut f.integrals).for_each(|v| *v = scale * *v + offset);
+            let found = told(&few);
+            assert!(found.mistakes.is_empty() && !found.faulty(), "{moments:?}, {scale}: {found:?}");
+            // The same images as intensities are told; where their range is small, both mistakes explain them.
+            few.frames.iter_mut().flat_map(|f| &mut f.integrals).for_each(|v| *v = 4000.0 * (-*v).exp());
+            let found = told(&few);
+            let named = found.mistakes.iter().any(|m| m.contains("are intensities") || scale < 1.0);
+            assert!(named && found.faulty(), "{moments:?}, {scale}: {found:?}");
+        }
+    }
+}
+
+#[test]
+fn motion_within_the_planes_through_both_sources_tells_nothing() {
+    // Both sources are at one height, and the vessel moves across the body.
+    let (at_rest, aside) = (blobs(1, 0.0), DVec3::new(0.0, 0.05, 0.0));
+    let moved = at_rest.iter().map(|(centre, radius)| (*centre + aside, *radius)).collect();
+    let found = told(&angiograms_of(&[(0.0, 0.0), (80.0, 0.0)], Flaws::default(), &[at_rest, moved]));
+    assert!(found.mistakes.is_empty() && found.verdict == Verdict::Unknown, "{found:?}");
+    assert!(found.missing.iter().any(|m| m.starts_with("views 0 and 1: what moves stays")), "{:?}", found.missing);
+}
+
+#[test]
+fn two_views_are_told_with_their_angle() {
+    let found = told(&angiograms(2, Flaws { seed: 4, ..Flaws::default() }));
+    // Angle between directions of longitude -30 and 40 and latitude 25 and 20 degrees, by the spherical law of cosines.
+    let [a, b, along] = [25f64, 20.0, 70.0].map(f64::to_radians);
+    let apart = (a.sin() * b.sin() + a.cos() * b.cos() * along.cos()).acos().to_degrees();
+    let said = format!("{apart:.0} degrees apart");
+    assert!(
+        found.warnings.iter().any(|w| w.contains(&said) && w.contains("ambiguous")),
+        "{said}: {:?}",
+        found.warnings
+    );
+    let three = told(&angiograms(3, Flaws { seed: 4, ..Flaws::default() }));
+    assert!(three.warnings.iter().all(|w| !w.contains("degrees apart")), "{:?}", three.warnings);
+}
+
+#[test]
+fn agreement_is_told_against_chance() {
+    let sound = compare(&angiograms(4, Flaws { seed: 5, ..Flaws::default() })).unwrap();
+    let [explained, by_chance] = sound.explained;
+    println!("{explained} {by_chance}");
+    assert!(explained > 0.95 && by_chance < 0.7, "{explained} {by_chance}");
+    assert_eq!(sound.verdict, Verdict::Agree);
 }
 
 #[test]

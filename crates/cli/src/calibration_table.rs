@@ -31,10 +31,17 @@ pub fn rows(calibration: &Calibration) -> Vec<Vec<String>> {
 /// Describes how well the views agree before and after the calibration.
 pub fn legend(calibration: &Calibration) -> String {
     let [before, after] = calibration.explained.map(|share| 100.0 * share);
+    let chance = calibration.explained_by_chance.map(|share| {
+        format!(
+            " By chance, with the vessels of a view displaced by a seventh of the image, it would be {:.0} %.",
+            100.0 * share
+        )
+    });
     format!(
         "The views disagreed by {:.2} pixels. All other views together explain {before:.0} % of a view's vessel pixels \
-         before the correction, and {after:.0} % after it.",
-        calibration.disagreement_px
+         before the correction, and {after:.0} % after it.{}",
+        calibration.disagreement_px,
+        chance.unwrap_or_default()
     )
 }
 

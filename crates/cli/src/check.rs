@@ -39,14 +39,10 @@ pub fn run(args: &CheckArgs) -> Result<()> {
             None => eprintln!("no pictures were written: no motion is consistent between the views"),
         }
     }
-    if found.sound() {
+    if !found.faulty() {
         return Ok(());
     }
-    let problem = match found.mistakes.first() {
-        Some(mistake) => format!("its views agree once one mistake is corrected: {mistake}"),
-        None => "its views do not show the same object".to_owned(),
-    };
-    Err(Error::data(&dataset.path, "dataset", problem))
+    Err(Error::data(&dataset.path, "dataset", found.conclusion()))
 }
 
 fn print(dataset: &Dataset, found: &Check) -> Result<()> {
@@ -54,17 +50,21 @@ fn print(dataset: &Dataset, found: &Check) -> Result<()> {
     for v in &found.views {
         let angle = |deg: Option<f64>| deg.map_or("-".into(), |deg| format!("{deg:.1}"));
         let (primary, secondary) = (angle(v.angles_deg.map(|a| a.0)), angle(v.angles_deg.map(|a| a.1)));
-        let (noise, edge) = (100.0 * v.noise, 100.0 * v.at_edges);
+        let noise = v.noise.map_or("-".into(), |noise| format!("{:.1}%", 100.0 * noise));
+        let edge = 100.0 * v.at_edges;
         let wide = v.wide_motion.map_or("-".into(), |size| format!("{:.1}%", 100.0 * size));
-        out!("{:4} {primary:>7} {secondary:>9} {:6} {noise:7.1}% {edge:11.1}% {wide:>12}", v.view, v.phases);
+        out!("{:4} {primary:>7} {secondary:>9} {:6} {noise:>8} {edge:11.1}% {wide:>12}", v.view, v.phases);
     }
     if let Some(agreement) = &found.agreement {
         out!("disagreement of the views (0: the same object, 100: unrelated images): {:.1}", 100.0 * agreement.fine);
         for pair in &agreement.pairs {
             let [a, b] = pair.views.map(|v| found.views[v].view);
-            out!("  views {a} and {b}: {:.1}", 100.0 * pair.residual);
+            let note = if pair.judged { "" } else { " (too little evidence to count)" };
+            out!("  views {a} and {b}: {:.1}{note}", 100.0 * pair.residual);
         }
     }
+    found.in_numbers().iter().for_each(|numbers| out!("{numbers}"));
+    found.missing.iter().for_each(|missing| out!("missing evidence: {missing}"));
     match found.mistakes.as_slice() {
         [] => (),
         [one] => out!("mistake: {one}"),
@@ -74,10 +74,10 @@ fn print(dataset: &Dataset, found: &Check) -> Result<()> {
         }
     }
     found.warnings.iter().for_each(|w| out!("warning: {w}"));
-    if found.sound() {
+    if !found.faulty() {
         let config = Config::preset(Preset::Fast);
         calibrate(dataset, &config)?.notes.iter().for_each(|note| out!("{note}"));
-        out!("the views show the same object");
+        out!("{}", found.conclusion());
     }
     Ok(())
 }

@@ -55,6 +55,16 @@ pub fn show_progress() -> impl FnMut(&Event) {
             say(&bar, format!("{device}: {parameters} parameters"));
             notes.iter().for_each(|n| say(&bar, format!("- {n}")));
         }
+        Event::Checked { conclusion, check, .. } => {
+            let warning = if check.faulty() { "warning: " } else { "- " };
+            say(&bar, format!("{warning}{conclusion}"));
+            check.in_numbers().iter().for_each(|numbers| say(&bar, format!("- {numbers}")));
+            check.missing.iter().for_each(|missing| say(&bar, format!("- missing evidence: {missing}")));
+            check.warnings.iter().for_each(|text| say(&bar, format!("warning: {text}")));
+            if check.faulty() {
+                say(&bar, "warning: `nertca-vk check DATA` looks for the usual mistakes".into());
+            }
+        }
         Event::Preparing { share } => bar.set_message(format!("initialising Gaussians, {:.0} %", 100.0 * share)),
         Event::Progress { loss, psnr, iterations_per_s, left_s, .. } => {
             bar.set_position(u64::from(loss.step));

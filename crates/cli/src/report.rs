@@ -3,6 +3,7 @@
 use super::page::Page;
 use super::tree_section::TreeSection;
 use nertca_vk::calibrate::correction::Calibration;
+use nertca_vk::check::Verdict;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::Result;
 use nertca_vk::gaussians::field::DynamicGaussians;
@@ -15,6 +16,7 @@ use nertca_vk::scan::canvas::in_words;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::Evaluation;
 use nertca_vk::trees::tree::BeatTree;
+use serde_json::Value;
 use std::path::{Path, PathBuf};
 
 /// Inputs of `report.html`.
@@ -47,7 +49,7 @@ impl Report<'_> {
     pub fn write(&self, path: &Path) -> Result<()> {
         let Report { gpu, tuning, model, dataset, evaluation, run, pictures, .. } = *self;
         let log = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
-        let metrics: Vec<serde_json::Value> = log.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+        let metrics: Vec<Value> = log.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
         let latest = |event: &str| metrics.iter().rev().find(|line| line["event"] == event);
         let mut facts = vec![
             ("dataset".to_owned(), dataset.path.display().to_string()),
@@ -65,6 +67,12 @@ impl Report<'_> {
             facts.push(("Gaussians".into(), gaussians_of(field)));
         }
         facts.extend(model.field.as_ref().map(|field| field.fact()));
+        let checked = latest("checked");
+        facts.extend(
+            checked.and_then(|line| line["conclusion"].as_str()).map(|text| ("views".to_owned(), text.to_owned())),
+        );
+        facts.extend(checked.and_then(numbers_of));
+        facts.extend(strings(checked, "missing").map(|text| ("missing evidence".to_owned(), text)));
         if let Some(started) = latest("started") {
             facts.push(("trained on".into(), started["device"].as_str().unwrap_or_default().to_owned()));
             let notes = started["notes"].as_array().into_iter().flatten().filter_map(|n| n.as_str());
@@ -81,10 +89,11 @@ impl Report<'_> {
             let files = dataset.training_views().into_iter().map(|view| (view, file(&run.join("report"), view)));
             files.filter(|(_, file)| file.is_file()).collect()
         };
+        let warnings = self.all_warnings(checked);
         let page = Page {
             title: run.file_name().map_or("run".into(), |name| name.to_string_lossy().into_owned()),
             facts,
-            warnings: self.all_warnings(),
+            warnings,
             metrics,
             history: History::read(run),
             evaluation,
@@ -102,10 +111,12 @@ impl Report<'_> {
         page.write(path)
     }
 
-    fn all_warnings(&self) -> Vec<String> {
+    fn all_warnings(&self, checked: Option<&Value>) -> Vec<String> {
         let (model, dataset) = (self.model, self.dataset);
-
-        let mut warnings = Vec::new();
+        let mut warnings: Vec<String> = strings(checked, "warnings").collect();
+        if let Some(conclusion) = checked.filter(|line| is_faulty(line)).and_then(|line| line["conclusion"].as_str()) {
+            warnings.insert(0, format!("Check the data (`nertca-vk check`): {conclusion}."));
+        }
         if model.step < model.config.train.iterations {
             warnings.push(format!(
                 "The run is not finished: {} of {} iterations.",
@@ -137,6 +148,30 @@ impl Report<'_> {
         warnings.extend(self.warnings.iter().cloned());
         warnings
     }
+}
+
+/// Texts in a list of a line of the log.
+fn strings(line: Option<&Value>, key: &str) -> impl Iterator<Item = String> {
+    let list = line.and_then(|line| line[key].as_array()).into_iter().flatten();
+    list.filter_map(|text| text.as_str().map(str::to_owned)).collect::<Vec<_>>().into_iter()
+}
+
+/// Tells whether the comparison of the views found a fault.
+fn is_faulty(checked: &Value) -> bool {
+    let sound = [Verdict::Agree, Verdict::Unknown].map(|verdict| serde_json::to_value(verdict).unwrap_or_default());
+    !sound.contains(&checked["verdict"])
+}
+
+/// Says how much the views agree, and how much they would by chance.
+fn numbers_of(checked: &Value) -> Option<(String, String)> {
+    let percent = |value: &Value| value.as_f64().map(|share| format!("{:.0} %", 100.0 * share));
+    let differs = percent(&checked["agreement"]["coarse"])?;
+    let [explained, by_chance] = [percent(&checked["explained"][0])?, percent(&checked["explained"][1])?];
+    let text = format!(
+        "{differs} of the moving contrast differs between two views (unrelated images: 100 %); all other views show a vessel for \
+         {explained} of a view's vessel pixels, and for {by_chance} by chance, with the vessels of the view displaced"
+    );
+    Some(("agreement".into(), text))
 }
 
 fn gaussians_of(field: &DynamicGaussians) -> String {

@@ -115,8 +115,7 @@ impl Targets {
         Series::of(dataset).iter().try_for_each(|s| check_finite(dataset, s))?;
         let strongest = median(motion.views.iter().map(|v| f64::from(v.background.strongest)).collect());
         if strongest.is_nan() || strongest <= 0.0 || motion.hull.share() == 0.0 {
-            let problem = "no motion is consistent between several views: check geometry, phases and noise";
-            return Err(Error::config("dataset", dataset.path.display(), problem));
+            return Err(Error::config("dataset", dataset.path.display(), no_common_motion(motion)));
         }
         let pixel = |v: usize| {
             let rays = &dataset.views[v].rays;
@@ -258,6 +257,19 @@ impl Targets {
         let row = &self.image_of[phase * self.n_views..][..self.n_views];
         row.iter().flatten().map(|image| (*image, &self.views[*image]))
     }
+}
+
+/// Says why no vessel was found, and names the views that show nothing.
+fn no_common_motion(motion: &SoftMotion) -> String {
+    let shows = |v: &&ViewEvidence| v.background.strongest > 0.0;
+    let blank: Vec<usize> = motion.views.iter().filter(|v| !shows(v)).map(|v| v.view).collect();
+    if blank.is_empty() {
+        return "no motion is consistent between several views: check geometry, phases and noise".into();
+    }
+    format!(
+        "no vessel was found that several views show, because nothing changes over the beat in views {blank:?}: all training \
+         images of such a view are alike. Correct its images, or leave the view out"
+    )
 }
 
 /// Weights of residuals: lower where pixels are noisy, so that the loss bends later there, and 0 where pixels are hidden.
