@@ -17,6 +17,7 @@ mod between_phases;
 mod calibration;
 mod check;
 mod degradations;
+mod few_phases;
 mod golden;
 mod golden_training;
 mod gradients;

@@ -15,6 +15,9 @@ const SUPPORT: f32 = 0.25;
 const KEEP_FOUR_VIEWS: f32 = 9.5;
 /// Minimum sum per view of a kept cell that fewer views see; the largest possible is 4.5.
 const KEEP_PER_VIEW: f32 = 7.0 / 3.0;
+/// Number of phases of a beat from which a vessel moves no further than to a neighbouring coarse cell from one phase to the next.
+/// With fewer, a vessel that is not there at the phase before or after says nothing against it.
+const TRACEABLE_PHASES: usize = 4;
 /// Lower limit of the neighbours' evidence, in units of a single view's strongest evidence against a cell.
 const MIN_SUPPORT: f32 = 2.5;
 
@@ -139,7 +142,7 @@ fn centre(min: DVec3, cell: f64, n: usize, index: usize) -> DVec3 {
 }
 
 /// Evidence of the neighbours at the previous and the next phase for each cell of a grid of `n` cells a side, per phase: a
-/// vessel moves at most a coarse cell per phase.
+/// vessel moves at most a coarse cell per phase where a beat has enough of them.
 fn support(votes: &Votes<'_>, min: DVec3, cell: f64, n: usize, n_phases: usize) -> Vec<Vec<f32>> {
     let least = MIN_SUPPORT * LEAST;
     let mut sums = vec![vec![least; n * n * n]; n_phases];
@@ -171,9 +174,20 @@ fn support(votes: &Votes<'_>, min: DVec3, cell: f64, n: usize, n_phases: usize) 
         .into_par_iter()
         .map(|t| {
             let (before, after) = (&best[(t + n_phases - 1) % n_phases], &best[(t + 1) % n_phases]);
-            before.iter().zip(after).map(|(a, b)| SUPPORT * (a + b)).collect()
+            before.iter().zip(after).map(|(a, b)| from_neighbours(*a, *b, n_phases)).collect()
         })
         .collect()
+}
+
+/// Evidence of the neighbours at the phase before and at the one after, of a beat with so many phases.
+fn from_neighbours(before: f32, after: f32, n_phases: usize) -> f32 {
+    match n_phases {
+        0 | 1 => 0.0,
+        // Both neighbours are the same images, which count once.
+        2 => SUPPORT * before.max(0.0),
+        n if n < TRACEABLE_PHASES => SUPPORT * (before.max(0.0) + after.max(0.0)),
+        _ => SUPPORT * (before + after),
+    }
 }
 
 /// Largest value of the 3 x 3 x 3 cells around each, axis by axis.
