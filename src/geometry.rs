@@ -154,7 +154,7 @@ impl CArm {
         ];
         for (field, value) in positive {
             if !(value.is_finite() && value > 0.0 && value < 1e5) {
-                return Err((field.into(), format!("{value} is not a positive length in mm")));
+                return Err((field.into(), format!("{value:?} is not a positive length in mm, below 100 m")));
             }
         }
         for (field, value) in [("primary_deg", self.primary_deg), ("secondary_deg", self.secondary_deg)] {
@@ -162,8 +162,8 @@ impl CArm {
                 return Err((field.into(), format!("{value} is not an angle in degrees")));
             }
         }
-        if !self.offset_mm.iter().all(|o| o.is_finite()) {
-            return Err(("offset_mm".into(), "is not finite".into()));
+        if !self.offset_mm.iter().all(|o| o.is_finite() && o.abs() < 1e4) {
+            return Err(("offset_mm".into(), format!("{:?} is not a position on a detector in mm", self.offset_mm)));
         }
         if !self.table_mm.iter().all(|t| t.is_finite() && t.abs() < 1e4) {
             return Err(("table_mm".into(), "is not a position in mm".into()));
@@ -397,6 +397,9 @@ pub(crate) mod tests {
         assert_eq!(bad.rays(4, 4).unwrap_err().0, "sid_mm");
         bad.sid_mm = 700.0;
         assert_eq!(bad.rays(4, 4).unwrap_err().0, "sod_mm");
+        // Rays that far from the axis have no place in single precision.
+        bad = CArm { offset_mm: [0.0, 1e30], ..carm(0.0, 0.0) };
+        assert_eq!(bad.rays(4, 4).unwrap_err().0, "offset_mm");
         assert_eq!(Matrix { matrix: [[1.0, 0.0, 0.0, 0.0]; 3] }.rays().unwrap_err().0, "matrix");
     }
 }

@@ -83,6 +83,13 @@ impl Prepared {
         }
         let factor = options.size.map_or(1, |size| columns.len().max(rows.len()).div_ceil(size.max(1)));
         let (width, height) = (columns.len() / factor, rows.len() / factor);
+        if let Some(size) = options.size.filter(|size| factor > 1 && *size != width.max(height)) {
+            notes.push(format!(
+                "{}: the images have {width} x {height} pixels, each the mean of {factor} x {factor}: only whole numbers of pixels \
+                 are averaged, so that the longest side is not {size}",
+                run.name()
+            ));
+        }
         if width < 16 || height < 16 {
             let problem = format!("is too small: {width} x {height} pixels would be left of {}", run.name());
             return Err(Error::config("size", options.size.unwrap_or_default(), problem));

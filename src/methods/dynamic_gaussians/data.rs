@@ -60,6 +60,8 @@ fn hull_and_targets(config: &Config, dataset: &Dataset, notes: &mut Vec<String>)
     notes.extend(wide_motion(&soft));
     notes.extend(without_motion(dataset, &soft));
     notes.push(format!("the soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
+    notes.extend(wide_hull(&soft, dataset));
+    notes.extend(idle_iterations(config));
     notes.push(match form {
         GaussianForm::Deformable => match targets.rest_phase {
             0 => "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"deformable\")".into(),
@@ -76,6 +78,37 @@ fn hull_and_targets(config: &Config, dataset: &Dataset, notes: &mut Vec<String>)
         _ => "each phase has its own set of Gaussians (gaussians.form = \"phase\")".into(),
     });
     Ok((soft.hull.to_hull(), targets))
+}
+
+/// Share of the box above which a hull holds much more than vessels, which fill less than a hundredth of a box.
+const WIDE_HULL: f64 = 0.02;
+/// Side of images, pixels, from which a wide hull makes iterations very slow.
+const LARGE_SIDE: usize = 300;
+
+/// Returns a note where the hull holds much more than vessels.
+fn wide_hull(soft: &SoftMotion, dataset: &Dataset) -> Option<String> {
+    (soft.hull.share() > WIDE_HULL).then(|| {
+        let mut note = "that is far more than vessels fill: the views may not show the same object (`check` tells), only two views may \
+                        be given, or much more than vessels may move; each iteration takes the longer, the more the hull keeps"
+            .to_owned();
+        if dataset.width.max(dataset.height) > LARGE_SIDE {
+            note += "; images of half the width and height take about a quarter of the time";
+        }
+        note
+    })
+}
+
+/// Returns a note where more iterations were asked for than usual, without more of them for the vessels.
+fn idle_iterations(config: &Config) -> Option<String> {
+    let (all, vessels) = (config.train.iterations, config.gaussian_iterations());
+    let usual = Config::preset(config.preset);
+    let as_usual = config.gaussians.iterations <= usual.gaussians.iterations;
+    (all > usual.train.iterations && as_usual && vessels < all).then(|| {
+        format!(
+            "the vessels are fitted in the first {vessels} of the {all} iterations, the others fit the static background only: a \
+             higher gaussians.iterations fits the vessels for longer"
+        )
+    })
 }
 
 /// Returns a note on the frames that Gaussians are not fitted to: frames of views with a single phase.
