@@ -137,7 +137,8 @@ pub fn newest(run: &Path) -> Result<PathBuf> {
         Error::data(
             run,
             "checkpoint",
-            "there is no checkpoint-*.safetensors in this directory: the run may not have saved any checkpoint yet",
+            "there is no checkpoint-*.safetensors in this directory: the run may not have saved any checkpoint yet, and is then \
+             trained from the start, without --resume",
         )
     })
 }
@@ -145,9 +146,26 @@ pub fn newest(run: &Path) -> Result<PathBuf> {
 /// Returns the model of a run's newest checkpoint, or of a checkpoint file.
 ///
 /// # Errors
-/// Errors of [`newest`] and [`Checkpoint::read`].
+/// Errors of [`newest`] and [`Checkpoint::read`]; that of a broken checkpoint names the newest older one that can be read.
 pub fn newest_model(run: &Path) -> Result<Model> {
-    Ok(Checkpoint::read(&newest(run)?)?.model)
+    match Checkpoint::read(&newest(run)?) {
+        Ok(checkpoint) => Ok(checkpoint.model),
+        Err(Error::Data { file, field, problem }) => match intact_before(run, &file) {
+            None => Err(Error::Data { file, field, problem }),
+            Some(older) => {
+                let older = older.file_name().unwrap_or_default().to_string_lossy().into_owned();
+                let problem = format!("{problem}. {older} in the same run is intact: remove the broken file to use it");
+                Err(Error::Data { file, field, problem })
+            }
+        },
+        Err(other) => Err(other),
+    }
+}
+
+/// Returns the newest checkpoint of a run directory before `broken` that can be read.
+fn intact_before(run: &Path, broken: &Path) -> Option<PathBuf> {
+    let older = list(run).ok()?.into_iter().map(|(_, path)| path).take_while(|path| path != broken).collect::<Vec<_>>();
+    older.into_iter().rev().find(|path| Checkpoint::read(path).is_ok())
 }
 
 impl Checkpoint {

@@ -7,7 +7,7 @@ const USAGE: u8 = 2;
 /// Exit code when no Vulkan device fits.
 const NO_DEVICE: u8 = 3;
 /// Exit code for failures that may not occur at a later attempt (`EX_TEMPFAIL`); schedulers use it.
-const TRY_AGAIN: u8 = 75;
+pub const TRY_AGAIN: u8 = 75;
 /// Exit code after a stop by Ctrl-C or SIGTERM; the work done is saved.
 pub const INTERRUPTED: u8 = 130;
 

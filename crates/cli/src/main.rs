@@ -25,6 +25,7 @@ mod geometry_picture;
 mod info;
 mod kernels;
 mod lettering;
+mod memory;
 mod options;
 mod page;
 mod plot;

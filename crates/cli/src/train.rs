@@ -1,6 +1,7 @@
 //! `train`: performs a run and writes its report.
 
 use super::eval::print_table;
+use super::memory::room_for_training;
 use super::options::{ConfigArgs, GlobalOptions};
 use super::progress::{print_json, show_progress, stop_flag};
 use super::report::Report;
@@ -16,7 +17,7 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::run::events::Event;
 use nertca_vk::run::info::RunInfo;
-use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
+use nertca_vk::run::reconstruct::{CONFIG, RunOptions, reconstruct};
 use nertca_vk::run::score::{ScoreOptions, as_trained, evaluate_model};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::{Evaluation, moving_field_warning};
@@ -101,13 +102,13 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     // A run that is to be resumed must exist.
     let _lock = if args.resume && !run.exists() { None } else { Some(take_run(run)?) };
     prepare_directory(run, args)?;
+    room_for_training()?;
     let cancel = stop_flag()?;
     let gpu = global.open_device()?;
     RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) }.write(run)?;
-    // A resumed run keeps its own configuration, for which the paths are chosen.
-    let config = if args.resume { newest_model(run)?.config } else { config };
+    let (config, resume) = if args.resume { resumed(run)? } else { (config, false) };
     let tuning = global.training_tuning(&gpu, &config, &dataset)?;
-    let options = RunOptions { tuning: &tuning, run, resume: args.resume, stop_at: args.stop_at, cancel: &cancel };
+    let options = RunOptions { tuning: &tuning, run, resume, stop_at: args.stop_at, cancel: &cancel };
     let mut observer: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
     reconstruct(&gpu, &config, &dataset, &options, &mut observer)?;
     let dataset = as_trained(dataset, run)?;
@@ -179,6 +180,17 @@ fn take_run(run: &Path) -> Result<Lock> {
         let problem = "another process trains into this run directory: wait for it, or choose another --out";
         Error::Busy(format!("{}: {problem}", run.display()))
     })
+}
+
+/// Returns the configuration of a run that is to be resumed, for which the paths are chosen, and whether there is a checkpoint to
+/// continue from: a run that was killed before its first one starts over.
+fn resumed(run: &Path) -> Result<(Config, bool)> {
+    let config = run.join(CONFIG);
+    if !config.is_file() || !checkpoint::list(run)?.is_empty() {
+        return Ok((newest_model(run)?.config, true));
+    }
+    eprintln!("{}: there is no checkpoint yet, so the run starts over, with its own configuration", run.display());
+    Ok((Config::load(None, Some(&config), &[])?, false))
 }
 
 fn prepare_directory(run: &Path, args: &TrainArgs) -> Result<()> {
