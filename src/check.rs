@@ -182,8 +182,7 @@ fn checked(dataset: &Dataset, observed: &Observed, thoroughly: bool) -> Check {
         _ if !mistakes.is_empty() => Verdict::Mistake,
         None => Verdict::Unknown,
         Some(_) if !differ => Verdict::Agree,
-        Some(_) if judged.firmly => Verdict::Disagree,
-        Some(_) => Verdict::Unknown,
+        Some(_) => Verdict::Disagree,
     };
     match &stated {
         None if observed.fine.pairs.is_empty() => warnings

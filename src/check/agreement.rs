@@ -34,7 +34,7 @@ pub struct PairAgreement {
     /// Share of the squares of their profiles that varies over the phases. Vessels that move within the planes through both
     /// sources change nothing in the profiles, whose difference then says nothing.
     pub varies: f64,
-    /// Whether the verdict rests on the pair: both views have enough evidence, or no two views have.
+    /// Whether the verdict rests on the pair.
     pub judged: bool,
 }
 

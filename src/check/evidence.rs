@@ -44,33 +44,22 @@ impl Evidence {
 #[derive(Debug, Clone)]
 pub(super) struct Judged {
     /// Evidence of each observed view.
-    pub(super) evidence: Vec<Evidence>,
-    /// Whether both views of the judged pairs have enough evidence. Otherwise the judged pairs are those with little: they can
-    /// show that views agree, but not that they do not.
-    pub(super) firmly: bool,
+    evidence: Vec<Evidence>,
     /// Pairs whose profiles hardly vary over the phases.
     still: Vec<[usize; 2]>,
 }
 
 impl Judged {
     pub(super) fn new(observed: &Observed) -> Judged {
-        let evidence = Evidence::of(observed);
-        let pairs = &observed.fine.pairs;
         let hardly = |pair: &&Pair| variation(&observed.fine, **pair) < MIN_VARIATION;
-        let still: Vec<[usize; 2]> = pairs.iter().filter(hardly).map(|pair| pair.views).collect();
-        let firm = |pair: &Pair| pair.views.iter().all(|v| evidence[*v] == Evidence::Enough);
-        let firmly = pairs.iter().any(|pair| firm(pair) && !still.contains(&pair.views));
-        Judged { evidence, firmly, still }
+        let still = observed.fine.pairs.iter().filter(hardly).map(|pair| pair.views).collect();
+        Judged { evidence: Evidence::of(observed), still }
     }
 
-    /// Tells whether a pair is judged.
+    /// Tells whether a pair is judged: from both views the motion of wide structures is removed, or from neither.
     pub(super) fn takes(&self, pair: &Pair) -> bool {
-        let counts = |evidence: Evidence| match evidence {
-            Evidence::Enough => true,
-            Evidence::FewPhases => !self.firmly,
-            Evidence::OnlyNoise | Evidence::Blank => false,
-        };
-        pair.views.iter().all(|v| counts(self.evidence[*v])) && !self.still.contains(&pair.views)
+        let [a, b] = pair.views.map(|view| self.evidence[view]);
+        a == b && matches!(a, Evidence::Enough | Evidence::FewPhases) && !self.still.contains(&pair.views)
     }
 
     /// Returns views with the judged pairs only.
@@ -87,7 +76,12 @@ impl Judged {
 
     /// Says of each view which evidence is missing.
     pub(super) fn missing(&self, dataset: &Dataset, observed: &Observed) -> Vec<String> {
-        let paired = |slot: usize| observed.fine.pairs.iter().any(|pair| pair.views.contains(&slot));
+        let pairs_of = |slot: usize| observed.fine.pairs.iter().filter(move |pair| pair.views.contains(&slot));
+        let paired = |slot: usize| pairs_of(slot).next().is_some();
+        let mixed = |slot: usize| {
+            paired(slot)
+                && !pairs_of(slot).any(|pair| pair.views.iter().all(|v| self.evidence[*v] == Evidence::FewPhases))
+        };
         let of_view = |slot: usize| {
             let (view, phases, of) = (observed.views[slot], observed.phases_of(slot), observed.n_phases());
             match self.evidence[slot] {
@@ -95,20 +89,23 @@ impl Judged {
                     Some(format!("view {view}: nothing changes over the beat: all its training images are alike"))
                 }
                 Evidence::OnlyNoise => Some(format!("view {view}: nothing that moves stands out of its noise")),
-                Evidence::FewPhases => Some(format!(
+                Evidence::FewPhases if mixed(slot) => Some(format!(
                     "view {view}: {phases} of {of} phases are too few to tell its vessels from a moving heart or diaphragm, so \
                      a difference from other views is no evidence that it shows another object"
                 )),
-                Evidence::Enough if !paired(slot) => Some(format!(
+                _ if !paired(slot) => Some(format!(
                     "view {view}: it looks along the same line as every other view, so they have no planes in common that \
                      can be compared"
                 )),
-                Evidence::Enough => None,
+                _ => None,
             }
         };
         let mut missing: Vec<String> = (0..observed.views.len()).filter_map(of_view).collect();
-        let telling = |slot: &usize| matches!(self.evidence[*slot], Evidence::Enough | Evidence::FewPhases);
-        for pair in self.still.iter().filter(|pair| pair.iter().all(telling)) {
+        let alike = |pair: &&[usize; 2]| {
+            let [a, b] = pair.map(|slot| self.evidence[slot]);
+            a == b && matches!(a, Evidence::Enough | Evidence::FewPhases)
+        };
+        for pair in self.still.iter().filter(alike) {
             let [a, b] = pair.map(|slot| observed.views[slot]);
             missing.push(format!(
                 "views {a} and {b}: what moves stays within the planes through both sources, so these two views cannot be compared"

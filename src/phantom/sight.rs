@@ -225,8 +225,7 @@ pub(super) fn check_lengths(file: &Path, tree: &TreeFile, sight: &Sight, voxel_m
     let bounds = tree.bounds();
     let extent = bounds.high_mm - bounds.low_mm;
     let voxels: f64 = grid_size(bounds, voxel_mm).iter().map(|n| *n as f64).product();
-    // Written so that a size which is not a number is refused as well.
-    if !(voxels <= MAX_DRAWN_VOXELS) {
+    if voxels.is_nan() || voxels > MAX_DRAWN_VOXELS {
         let problem = format!(
             "the vessels extend over {} x {} x {} mm, too much to be drawn with voxels of {voxel_mm} mm; they lie {}, and {}. \
              Check the largest coordinates: {UNITS}",
