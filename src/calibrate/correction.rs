@@ -108,9 +108,7 @@ impl Calibration {
         if !file.is_file() {
             return Ok(None);
         }
-        let text = files::read_limited(&file, MAX_BYTES)?;
-        let parsed = serde_json::from_slice(&text);
-        parsed.map(Some).map_err(|e| Error::data(&file, format!("line {}", e.line()), e.to_string()))
+        Ok(files::read_json(&file, MAX_BYTES).map(Some)?)
     }
 
     /// Stated geometry of a view that was corrected.

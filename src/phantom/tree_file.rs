@@ -49,8 +49,7 @@ impl TreeFile {
                 let lines = phases.into_iter().map(|file| -> Result<_> { Ok((file.clone(), vtp::read(&file)?)) });
                 TreeFile::of_lines(&lines.collect::<Result<Vec<_>>>()?)?
             }
-            _ => serde_json::from_slice(&files::read_limited(path, 1 << 30)?)
-                .map_err(|e| Error::data(path, format!("line {}", e.line()), e.to_string()))?,
+            _ => files::read_json(path, 1 << 30)?,
         };
         file.check(path)?;
         Ok(file)

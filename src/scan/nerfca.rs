@@ -18,6 +18,10 @@ use std::path::{Path, PathBuf};
 
 /// Name of the geometry file.
 pub const GENERAL: &str = "general.json";
+/// Name of the list of training frames that this program writes.
+pub const TRAINING_LIST: &str = "train-0.json";
+/// Name of the list of validation frames that this program writes.
+pub const VALIDATION_LIST: &str = "test-0.json";
 const MAX_JSON_BYTES: u64 = 256 << 20;
 
 /// Content of `general.json`: lengths in mm before the authors' 1e-2 scale, or already scaled, as `far_thresh` shows.
@@ -74,8 +78,7 @@ impl Entry {
 }
 
 fn read_json<T: serde::de::DeserializeOwned>(file: &Path) -> Result<T> {
-    let text = files::read_limited(file, MAX_JSON_BYTES)?;
-    serde_json::from_slice(&text).map_err(|e| Error::data(file, format!("line {}", e.line()), e.to_string()))
+    Ok(files::read_json(file, MAX_JSON_BYTES)?)
 }
 
 /// Reads a dataset in the authors' layout.

@@ -76,8 +76,7 @@ impl Truth {
     /// [`Error::Io`] where there is none, [`Error::Data`] for a file of another kind.
     pub fn load(dataset: &Path) -> Result<Truth> {
         let file = dataset.join(TRUTH);
-        let truth: Truth = serde_json::from_slice(&files::read_limited(&file, MAX_BYTES)?)
-            .map_err(|e| Error::data(&file, format!("line {}", e.line()), e.to_string()))?;
+        let truth: Truth = files::read_json(&file, MAX_BYTES)?;
         if truth.format != FORMAT || truth.version != VERSION {
             let found = format!(
                 "is `{}` version {}, but `{FORMAT}` version {VERSION} is expected",

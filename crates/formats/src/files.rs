@@ -1,14 +1,64 @@
-//! Writes output files atomically: a file is written under a temporary name beside its target, then renamed.
+//! Writes output files atomically: a file is written under a temporary name beside its target, then renamed. Reads files that
+//! other programs wrote.
 
 use crate::error::{Error, Result};
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{BufWriter, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// Beginning of the names of files that are still being written.
 const PARTIAL: &str = ".partial-";
+/// Largest number of symbolic links that lead from one to the next, as Linux limits it.
+const MAX_LINKS: usize = 40;
 
-/// Writes `bytes` to `path` through a temporary file in the same directory; creates missing directories.
+/// Paths under which this process is writing.
+static UNFINISHED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+
+fn unfinished() -> MutexGuard<'static, BTreeSet<PathBuf>> {
+    UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Registers a temporary file or directory for as long as this value lives, so that [`remove_unfinished`] can remove it.
+#[derive(Debug)]
+pub struct Unfinished(PathBuf);
+
+impl Unfinished {
+    /// Registers a path.
+    pub fn new(path: &Path) -> Unfinished {
+        unfinished().insert(path.to_path_buf());
+        Unfinished(path.to_path_buf())
+    }
+}
+
+impl Drop for Unfinished {
+    fn drop(&mut self) {
+        unfinished().remove(&self.0);
+    }
+}
+
+/// Removes all that this process is writing at the moment. A program that a signal ends calls it last.
+pub fn remove_unfinished() {
+    let mut paths = unfinished();
+    for path in std::mem::take(&mut *paths) {
+        // There is nobody left to tell that a file could not be removed.
+        let _ = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
+    }
+}
+
+/// Returns the path to which the symbolic links at the end of a path lead; the target may be missing.
+fn behind_links(path: &Path) -> PathBuf {
+    let mut path = path.to_path_buf();
+    for _ in 0..MAX_LINKS {
+        let Ok(target) = std::fs::read_link(&path) else { break };
+        path = path.parent().map_or_else(|| target.clone(), |parent| parent.join(&target));
+    }
+    path
+}
+
+/// Writes `bytes` to `path` through a temporary file in the same directory; creates missing directories. A symbolic link stays,
+/// and the file to which it leads is replaced. A device or a named pipe cannot be replaced and is written to.
 ///
 /// # Errors
 /// [`Error::Io`] naming the path.
@@ -35,7 +85,11 @@ pub fn write_atomic_by<E: From<Error>>(
     path: &Path,
     produce: impl FnOnce(&mut BufWriter<&File>) -> std::result::Result<(), E>,
 ) -> std::result::Result<(), E> {
-    let directory = match path.parent() {
+    if std::fs::metadata(path).is_ok_and(|meta| !meta.is_file()) {
+        return write_in_place(path, produce);
+    }
+    let target = behind_links(path);
+    let directory = match target.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
     };
@@ -47,13 +101,28 @@ pub fn write_atomic_by<E: From<Error>>(
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     let temporary = builder.tempfile_in(directory).map_err(Error::io("create a temporary file in", directory))?;
     hold(temporary.as_file());
+    let _unfinished = Unfinished::new(temporary.path());
     let mut writer = BufWriter::new(temporary.as_file());
     produce(&mut writer)?;
     writer.flush().map_err(Error::io("write", path))?;
     drop(writer);
     temporary.as_file().sync_all().map_err(Error::io("flush", path))?;
-    temporary.persist(path).map_err(|e| e.error).map_err(Error::io("rename into place", path))?;
+    temporary.persist(&target).map_err(|e| e.error).map_err(Error::io("rename into place", path))?;
     Ok(())
+}
+
+/// Writes to something that is no regular file, such as a device or a named pipe.
+fn write_in_place<E: From<Error>>(
+    path: &Path,
+    produce: impl FnOnce(&mut BufWriter<&File>) -> std::result::Result<(), E>,
+) -> std::result::Result<(), E> {
+    if path.is_dir() {
+        return Err(Error::data(path, "file", "is a folder; the name of a file is needed").into());
+    }
+    let file = File::options().write(true).open(path).map_err(Error::io("write", path))?;
+    let mut writer = BufWriter::new(&file);
+    produce(&mut writer)?;
+    Ok(writer.flush().map_err(Error::io("write", path))?)
 }
 
 /// Locks a file that is being written, for as long as it is open, so that [`remove_partial`] does not remove it.
@@ -126,6 +195,17 @@ pub fn pretty_json(value: &impl serde::Serialize) -> Result<String> {
     serde_json::to_string_pretty(value).map_err(|e| Error::Internal(e.to_string()))
 }
 
+/// Returns the path of one file of a series with one file per phase: `NAME_0003.EXT` for `NAME.EXT`.
+pub fn of_phase(path: &Path, phase: u32) -> PathBuf {
+    let mut name = path.file_stem().unwrap_or_default().to_owned();
+    name.push(format!("_{phase:04}"));
+    if let Some(extension) = path.extension() {
+        name.push(".");
+        name.push(extension);
+    }
+    path.with_file_name(name)
+}
+
 /// Creates a directory and its parents.
 ///
 /// # Errors
@@ -140,6 +220,9 @@ pub fn create_directory(path: &Path) -> Result<()> {
 /// [`Error::Io`] when it cannot be read, [`Error::Data`] when it is too large.
 pub fn read_limited(path: &Path, limit: u64) -> Result<Vec<u8>> {
     let meta = std::fs::metadata(path).map_err(Error::io("read", path))?;
+    if meta.is_dir() {
+        return Err(Error::data(path, "file", "is a folder; a file is needed"));
+    }
     if !meta.is_file() {
         return Err(Error::data(path, "file", "is not a regular file"));
     }
@@ -147,6 +230,82 @@ pub fn read_limited(path: &Path, limit: u64) -> Result<Vec<u8>> {
         return Err(Error::data(path, "size", format!("{} bytes exceed the maximum, {limit}", meta.len())));
     }
     std::fs::read(path).map_err(Error::io("read", path))
+}
+
+/// Byte order mark with which some editors begin a text, in UTF-8.
+const MARK: &[u8] = &[0xef, 0xbb, 0xbf];
+
+/// Reads a text in UTF-8 of at most `limit` bytes, without its byte order mark if it has one.
+///
+/// # Errors
+/// Errors of [`read_limited`]; [`Error::Data`] for another encoding.
+pub fn read_text(path: &Path, limit: u64) -> Result<String> {
+    let mut bytes = read_limited(path, limit)?;
+    if bytes.starts_with(MARK) {
+        bytes.drain(..MARK.len());
+    }
+    if bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]) {
+        return Err(Error::data(path, "text", "is encoded in UTF-16; save it in UTF-8"));
+    }
+    String::from_utf8(bytes).map_err(|e| {
+        let at = e.utf8_error().valid_up_to();
+        Error::data(path, "text", format!("is not in UTF-8 from byte {at} on; save it in UTF-8"))
+    })
+}
+
+/// Reads a JSON file of at most `limit` bytes.
+///
+/// # Errors
+/// Errors of [`read_text`]; [`Error::Data`] naming the line of what does not fit.
+pub fn read_json<T: serde::de::DeserializeOwned>(path: &Path, limit: u64) -> Result<T> {
+    let text = read_text(path, limit)?;
+    serde_json::from_str(&text).map_err(|e| Error::data(path, format!("line {}", e.line()), e.to_string()))
+}
+
+/// Represents a path in JSON: a string, or where it is not text in UTF-8, an object with its bytes. For `#[serde(with = ...)]`.
+pub mod path_in_json {
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+    use std::path::{Path, PathBuf};
+
+    #[derive(Serialize, Deserialize)]
+    #[serde(untagged)]
+    enum Stored {
+        Text(String),
+        Bytes { bytes: Vec<u8> },
+    }
+
+    /// Writes a path.
+    ///
+    /// # Errors
+    /// Errors of the serialiser.
+    pub fn serialize<S: Serializer>(path: &Path, to: S) -> Result<S::Ok, S::Error> {
+        let stored = match path.to_str() {
+            Some(text) => Stored::Text(text.to_owned()),
+            None => Stored::Bytes { bytes: path.as_os_str().as_encoded_bytes().to_vec() },
+        };
+        stored.serialize(to)
+    }
+
+    /// Reads a path.
+    ///
+    /// # Errors
+    /// Errors of the deserialiser.
+    pub fn deserialize<'a, D: Deserializer<'a>>(from: D) -> Result<PathBuf, D::Error> {
+        Ok(match Stored::deserialize(from)? {
+            Stored::Text(text) => PathBuf::from(text),
+            Stored::Bytes { bytes } => of_bytes(bytes),
+        })
+    }
+
+    #[cfg(unix)]
+    fn of_bytes(bytes: Vec<u8>) -> PathBuf {
+        PathBuf::from(<std::ffi::OsString as std::os::unix::ffi::OsStringExt>::from_vec(bytes))
+    }
+
+    #[cfg(not(unix))]
+    fn of_bytes(bytes: Vec<u8>) -> PathBuf {
+        PathBuf::from(String::from_utf8_lossy(&bytes).into_owned())
+    }
 }
 
 #[cfg(test)]
@@ -183,5 +342,70 @@ mod tests {
         assert!(Lock::take(&path).unwrap().is_none());
         drop(held);
         assert!(Lock::take(&path).unwrap().is_some());
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn links_stay_and_devices_are_written_to() {
+        let directory = tempfile::tempdir().unwrap();
+        let at = |name: &str| directory.path().join(name);
+        std::fs::create_dir(at("elsewhere")).unwrap();
+        std::fs::write(at("elsewhere/file"), b"old").unwrap();
+        for (link, target) in [("one", "two"), ("two", "elsewhere/file"), ("dangling", "elsewhere/new")] {
+            std::os::unix::fs::symlink(target, at(link)).unwrap();
+        }
+        write_atomic(&at("one"), b"new").unwrap();
+        write_atomic(&at("dangling"), b"made").unwrap();
+        assert_eq!(std::fs::read(at("elsewhere/file")).unwrap(), b"new");
+        assert_eq!(std::fs::read(at("elsewhere/new")).unwrap(), b"made");
+        assert!(["one", "two", "dangling"].iter().all(|link| at(link).is_symlink()));
+        write_atomic(Path::new("/dev/null"), b"lost").unwrap();
+        assert!(!std::fs::metadata("/dev/null").unwrap().is_file());
+        let refused = write_atomic(directory.path(), b"x").unwrap_err().to_string();
+        assert!(refused.contains("is a folder"), "{refused}");
+    }
+
+    #[test]
+    fn texts_are_read_with_and_without_a_mark() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("text.json");
+        let read = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).unwrap();
+            read_json::<Vec<u32>>(&path, 100).map_err(|e| e.to_string())
+        };
+        assert_eq!(read(b"[1, 2]"), Ok(vec![1, 2]));
+        assert_eq!(read(b"\xef\xbb\xbf[1, 2]"), Ok(vec![1, 2]));
+        assert!(read(b"\xff\xfe[\0").unwrap_err().contains("UTF-16"));
+        assert!(read(b"[1, \xe9]").unwrap_err().contains("byte 4"));
+        assert!(read(b"[1,\n x]").unwrap_err().contains("line 2"));
+        assert!(read_json::<u32>(directory.path(), 9).unwrap_err().to_string().contains("is a folder"));
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn paths_of_any_bytes_return_from_json() {
+        #[derive(serde::Serialize, serde::Deserialize)]
+        struct Record {
+            #[serde(with = "path_in_json")]
+            path: PathBuf,
+        }
+        for (bytes, text) in [(&b"a/\xe9"[..], r#"{"path":{"bytes":[97,47,233]}}"#), (b"a/b", r#"{"path":"a/b"}"#)] {
+            let path = PathBuf::from(<std::ffi::OsStr as std::os::unix::ffi::OsStrExt>::from_bytes(bytes));
+            assert_eq!(serde_json::to_string(&Record { path: path.clone() }).unwrap(), text);
+            assert_eq!(serde_json::from_str::<Record>(text).unwrap().path, path);
+        }
+    }
+
+    #[test]
+    fn what_is_being_written_is_removed_on_demand() {
+        let directory = tempfile::tempdir().unwrap();
+        let target = directory.path().join("whole");
+        let written = write_atomic_by(&target, |file| -> Result<()> {
+            file.write_all(b"half").map_err(Error::io("write", &target))?;
+            remove_unfinished();
+            Ok(())
+        });
+        assert!(written.is_err(), "the temporary file is gone");
+        assert_eq!(std::fs::read_dir(directory.path()).unwrap().count(), 0);
     }
 }

@@ -74,8 +74,7 @@ struct MethodSection {
 /// # Errors
 /// [`Error::Data`] with the line of what cannot be run; [`Error::Io`].
 pub fn read(file: &Path, data_directory: Option<&Path>) -> Result<Study> {
-    let text = String::from_utf8(files::read_limited(file, MAX_BYTES)?)
-        .map_err(|e| Error::data(file, "text", e.to_string()))?;
+    let text = files::read_text(file, MAX_BYTES)?;
     let beside = match file.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),

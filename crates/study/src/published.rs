@@ -2,7 +2,7 @@
 
 use crate::scores::Score;
 use crate::text::Text;
-use nertca_vk::error::{Error, Result};
+use nertca_vk::error::Result;
 use nertca_vk::files;
 use serde::Deserialize;
 use std::path::Path;
@@ -52,10 +52,9 @@ impl Published {
     /// Reads published values from a file.
     ///
     /// # Errors
-    /// [`Error::Data`] with the line of the problem; [`Error::Io`].
+    /// [`nertca_vk::error::Error::Data`] with the line of the problem; [`nertca_vk::error::Error::Io`].
     pub fn read(file: &Path) -> Result<Published> {
-        let text = String::from_utf8(files::read_limited(file, MAX_BYTES)?)
-            .map_err(|e| Error::data(file, "text", e.to_string()))?;
+        let text = files::read_text(file, MAX_BYTES)?;
         Text { file, text: &text }.parse()
     }
 
