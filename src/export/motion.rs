@@ -150,10 +150,8 @@ impl MotionExport<'_> {
 
     /// Writes one file per phase: `name.vtk`, or `name_0000.vtk` and so on.
     fn write_vtk(&self, path: &Path) -> Result<Vec<PathBuf>> {
-        let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let one = |phase: &u32| {
-            let file =
-                if self.sequence { path.with_file_name(format!("{stem}_{phase:04}.vtk")) } else { path.to_path_buf() };
+            let file = if self.sequence { files::of_phase(path, *phase) } else { path.to_path_buf() };
             let title = format!("{}, LPS, phase {phase}; {CAVEAT}", self.header().quantity);
             files::write_atomic_with(&file, |out| {
                 out.write_all(&vtk::vector_header_of(&self.header(), "displacement_mm", &title))?;

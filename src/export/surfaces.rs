@@ -92,14 +92,12 @@ pub fn write_meshes(
         files::write_atomic(path, &gltf::to_glb(&meshes)?)?;
         return Ok(vec![path.to_path_buf()]);
     }
-    let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-    let extension = path.extension().unwrap_or_default().to_string_lossy().into_owned();
     meshes
         .iter()
         .map(|(phase, mesh)| {
             let file = match meshes.len() {
                 1 => path.to_path_buf(),
-                _ => path.with_file_name(format!("{stem}_{phase:04}.{extension}")),
+                _ => files::of_phase(path, *phase),
             };
             let bytes = match format {
                 MeshFormat::Stl => mesh.to_stl(),

@@ -38,7 +38,7 @@ pub enum Format {
 impl Format {
     /// Returns format and compression for the end of a file name.
     pub fn of(path: &Path) -> Option<(Format, Compression)> {
-        let name = path.file_name()?.to_str()?.to_lowercase();
+        let name = path.file_name()?.to_string_lossy().to_lowercase();
         if name.ends_with(".nii.gz") {
             return Some((Format::Nifti, Compression::Gzip));
         }
@@ -228,11 +228,9 @@ impl VolumeExport {
 
     /// Writes one file per phase: `name.vtk`, or `name_0000.vtk` and so on.
     fn write_vtk(&self, path: &Path, sample: Sampler<'_>) -> Result<Vec<PathBuf>> {
-        let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let mut made = Vec::new();
         for phase in &self.phases {
-            let file =
-                if self.sequence { path.with_file_name(format!("{stem}_{phase:04}.vtk")) } else { path.to_path_buf() };
+            let file = if self.sequence { files::of_phase(path, *phase) } else { path.to_path_buf() };
             files::write_atomic_by(&file, |out| {
                 let failed = |e| Error::io("write", &file)(e);
                 out.write_all(&vtk::header_of(&self.header(), *phase)).map_err(failed)?;

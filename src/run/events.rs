@@ -1,6 +1,7 @@
 //! Events that a run reports to its observer.
 
 use crate::check::Check;
+use crate::files;
 use crate::fitting::losses::StepLoss;
 use crate::gpu::record::PassTime;
 use serde::Serialize;
@@ -89,7 +90,8 @@ pub enum Event {
     Saved {
         /// Iterations it holds.
         step: u32,
-        /// File.
+        /// File; where its path is not text in UTF-8, the line holds its bytes.
+        #[serde(serialize_with = "files::path_in_json::serialize")]
         path: PathBuf,
     },
     /// Progress of the evaluation after training, image by image; not a line of `metrics.jsonl`.

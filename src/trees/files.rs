@@ -109,7 +109,7 @@ pub fn note(beat: &BeatTree) -> &'static str {
 /// phase and, for VTK, a collection, even for one phase.
 ///
 /// # Errors
-/// [`Error::Io`].
+/// [`Error::Config`] for the name of a VTK series that is not text; [`Error::Io`].
 pub fn write(beat: &BeatTree, path: &Path, format: TreeFormat, sequence: bool) -> Result<Vec<PathBuf>> {
     match format {
         TreeFormat::Json => {
@@ -117,6 +117,11 @@ pub fn write(beat: &BeatTree, path: &Path, format: TreeFormat, sequence: bool) -
             Ok(vec![path.to_path_buf()])
         }
         TreeFormat::Vtp => {
+            if sequence && path.file_name().is_some_and(|name| name.to_str().is_none()) {
+                let problem =
+                    "is not text in UTF-8, and the .pvd that lists the files cannot name them: choose another name";
+                return Err(Error::config("--out", path.display(), problem));
+            }
             let mut made = write_phases(beat, path, sequence, to_vtp)?;
             if sequence {
                 // The collection is written last, so that all files it lists exist.
@@ -141,11 +146,9 @@ fn write_phases(
     sequence: bool,
     content: fn(&BeatTree, &PhaseTree) -> String,
 ) -> Result<Vec<PathBuf>> {
-    let part = |part: Option<&std::ffi::OsStr>| part.unwrap_or_default().to_string_lossy().into_owned();
-    let (stem, extension) = (part(path.file_stem()), part(path.extension()));
     let write = |tree: &PhaseTree| -> Result<PathBuf> {
         let file = match sequence {
-            true => path.with_file_name(format!("{stem}_{:04}.{extension}", tree.phase)),
+            true => files::of_phase(path, tree.phase),
             false => path.to_path_buf(),
         };
         files::write_atomic(&file, content(beat, tree).as_bytes())?;
