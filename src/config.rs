@@ -19,6 +19,7 @@ pub mod sections;
 mod x_gaussian;
 
 use crate::error::{Error, Result};
+use crate::files;
 pub use forms::{
     CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, R2Integral, R2Start, StaticData,
     StaticForm,
@@ -31,6 +32,11 @@ use sections::{
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use strum::{IntoStaticStr, VariantArray};
+
+/// Largest accepted size of a configuration file, bytes.
+const MAX_FILE_BYTES: u64 = 1 << 20;
+/// Largest number below which a float represents every whole number: 2^53.
+const MAX_WHOLE: f64 = 9_007_199_254_740_992.0;
 
 /// A named set of defaults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
@@ -113,10 +119,16 @@ impl Config {
         let overlay = match file {
             None => toml::Table::new(),
             Some(path) => {
-                let text = std::fs::read_to_string(path).map_err(Error::io("read", path))?;
+                let text = files::read_text(path, MAX_FILE_BYTES)?;
                 text.parse::<toml::Table>()
                     .map_err(|e| Error::config(path.display().to_string(), "TOML", e.message()))?
             }
+        };
+        let in_file = |error: Error| match (error, file) {
+            (Error::Config { field, value, problem }, Some(path)) => {
+                Error::Config { field: format!("{}: {field}", path.display()), value, problem }
+            }
+            (error, _) => error,
         };
         let named = match overlay.get("preset") {
             None => None,
@@ -124,10 +136,12 @@ impl Config {
                 value
                     .clone()
                     .try_into::<Preset>()
-                    .map_err(|e| Error::config("preset", value, e.message().to_owned()))?,
+                    .map_err(|e| in_file(Error::config("preset", value, e.message().to_owned())))?,
             ),
         };
-        Config::preset(preset.or(named).unwrap_or_default()).overlaid(overlay, settings, &[])
+        let base = Config::preset(preset.or(named).unwrap_or_default());
+        base.check_values(&overlay).map_err(in_file)?;
+        base.overlaid(overlay, settings, &[])
     }
 
     /// Returns this configuration with `key=value` settings.
@@ -155,6 +169,17 @@ impl Config {
         self.overlaid(toml::Table::new(), settings, constants)
     }
 
+    /// Checks that each value of a table fits its key by itself, whatever the others are.
+    fn check_values(&self, overlay: &toml::Table) -> Result<()> {
+        let before = toml::Table::try_from(self).map_err(|e| Error::Internal(e.to_string()))?;
+        let mut overlay = overlay.clone();
+        renamed::rename(&mut overlay);
+        acting::keys(&overlay).iter().filter(|key| *key != "preset").try_for_each(|key| {
+            let Some(value) = acting::at(&overlay, key) else { return Ok(()) };
+            check_value(&before, key, value)
+        })
+    }
+
     /// Overrides this configuration with the table of a file, then with settings and constants; the preset is kept. Constants of
     /// the program are accepted in `constants` alone.
     fn overlaid(&self, overlay: toml::Table, settings: &[String], constants: &[String]) -> Result<Config> {
@@ -171,7 +196,9 @@ impl Config {
                 Error::config("setting", setting, "is not of the form key=value, e.g. train.rays=512")
             })?;
             let key = renamed::current(key.trim());
-            merge(&mut table, nested(&key, parse_value(value.trim())), "")?;
+            let value = parse_value(value.trim());
+            check_value(&before, &key, &value)?;
+            merge(&mut table, nested(&key, value), "")?;
             if at < settings.len() {
                 given.push(key);
             }
@@ -220,13 +247,26 @@ impl Config {
     }
 }
 
+/// Reads a value as TOML has it, or a number as people type it (`.003`, `5.`, `007`); all else is a string.
 fn parse_value(text: &str) -> toml::Value {
-    // A value that TOML does not parse is taken as a string.
-    format!("v = {text}")
-        .parse::<toml::Table>()
-        .ok()
-        .and_then(|mut t| t.remove("v"))
-        .unwrap_or_else(|| toml::Value::String(text.to_owned()))
+    let toml = format!("v = {text}").parse::<toml::Table>().ok().and_then(|mut t| t.remove("v"));
+    toml.or_else(|| number(text)).unwrap_or_else(|| toml::Value::String(text.to_owned()))
+}
+
+/// Reads a number that TOML would write in another way.
+fn number(text: &str) -> Option<toml::Value> {
+    let plain = text.replace('_', "");
+    let whole = plain.parse::<i64>().ok().map(toml::Value::Integer);
+    let starts_as_number = plain.starts_with(|c: char| c.is_ascii_digit() || "+-.".contains(c));
+    whole.or_else(|| plain.parse::<f64>().ok().filter(|_| starts_as_number).map(toml::Value::Float))
+}
+
+/// Checks that a value fits a key of a complete configuration.
+fn check_value(before: &toml::Table, key: &str, value: &toml::Value) -> Result<()> {
+    let mut changed = before.clone();
+    merge(&mut changed, nested(key, value.clone()), "")?;
+    let read = changed.try_into::<Config>();
+    read.map(drop).map_err(|e: toml::de::Error| Error::config(key, value, e.message().to_owned()))
 }
 
 fn nested(key: &str, value: toml::Value) -> toml::Table {
@@ -253,6 +293,9 @@ fn merge(base: &mut toml::Table, overlay: toml::Table, prefix: &str) -> Result<(
             }
             (Some(toml::Value::Table(inner)), toml::Value::Table(over)) => merge(inner, over, &name)?,
             (Some(toml::Value::Float(slot)), toml::Value::Integer(i)) => *slot = i as f64,
+            (Some(toml::Value::Integer(slot)), toml::Value::Float(x)) if x.fract() == 0.0 && x.abs() <= MAX_WHOLE => {
+                *slot = x as i64;
+            }
             (Some(slot), value) if slot.type_str() == value.type_str() => *slot = value,
             (Some(slot), value) => {
                 return Err(Error::config(name, value, format!("expected {}", slot.type_str())));
@@ -282,6 +325,41 @@ mod tests {
         let config = Config::load(None, Some(&file), &["train.rays=64".into(), "static.lr=1".into()]).unwrap();
         assert_eq!((config.train.rays, config.train.iterations, config.dynamic.width), (64, 7, 128));
         assert_eq!((config.preset, config.static_field.lr), (Preset::Paper, 1.0));
+    }
+
+    #[test]
+    fn numbers_are_read_as_people_type_them() {
+        let lr = |text: &str| Config::load(None, None, &[format!("static.lr={text}")]).unwrap().static_field.lr;
+        for text in ["0.003", ".003", "3e-3", "3E-3", "+.003", "+0.003", "0.003_0", "00.003"] {
+            assert_eq!(lr(text), 0.003, "{text}");
+        }
+        assert_eq!((lr("5"), lr("5."), lr("+5"), lr("1_0")), (5.0, 5.0, 5.0, 10.0));
+        let rays = |text: &str| Config::load(None, None, &[format!("train.rays={text}")]).unwrap().train.rays;
+        for text in ["1000", "1_000", "+1000", "1e3", "1000.0", "01000"] {
+            assert_eq!(rays(text), 1000, "{text}");
+        }
+    }
+
+    #[test]
+    fn what_does_not_fit_names_key_and_file() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = directory.path().join("mine.toml");
+        for (text, parts) in [
+            ("[train]\nrays = -1\n", &["mine.toml", "train.rays = -1", "invalid value"][..]),
+            ("[train]\nrays = 0.5\n", &["mine.toml", "train.rays = 0.5", "expected integer"]),
+            ("[train]\nray = 5\n", &["mine.toml", "train.ray ", "unknown key"]),
+            ("[gaussians]\nform = 'x y'\n", &["mine.toml", "gaussians.form", "unknown variant"]),
+            ("preset = 'quick'\n", &["mine.toml", "preset", "quick"]),
+        ] {
+            std::fs::write(&file, text).unwrap();
+            let told = Config::load(None, Some(&file), &[]).unwrap_err().to_string();
+            assert!(parts.iter().all(|part| told.contains(part)), "{text}: {told}");
+        }
+        let told = Config::load(None, None, &["train.rays=-1".into()]).unwrap_err().to_string();
+        assert!(told.contains("train.rays = -1"), "{told}");
+        std::fs::write(&file, b"\xef\xbb\xbfpreset = 'paper'\n").unwrap();
+        assert_eq!(Config::load(None, Some(&file), &[]).unwrap().preset, Preset::Paper);
+        assert!(Config::load(None, Some(directory.path()), &[]).unwrap_err().to_string().contains("is a folder"));
     }
 
     #[test]

@@ -58,7 +58,7 @@ impl Config {
 }
 
 /// Returns the value at a key such as `train.rays`.
-fn at<'a>(table: &'a toml::Table, key: &str) -> Option<&'a toml::Value> {
+pub(super) fn at<'a>(table: &'a toml::Table, key: &str) -> Option<&'a toml::Value> {
     match key.split_once('.') {
         None => table.get(key),
         Some((section, rest)) => at(table.get(section)?.as_table()?, rest),
