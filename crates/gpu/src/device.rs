@@ -2,7 +2,7 @@
 //! allocator, timeline, debug names.
 
 use super::capabilities::{DeviceInfo, DeviceKind, KernelFeatures, compute_family, family_at};
-use super::instance::{DRIVER_PACKAGES, Instance, Loader};
+use super::instance::{Instance, Loader, remedy};
 use super::lock::lock;
 use super::memory::DeviceMemory;
 use super::pace::PictureRequests;
@@ -191,7 +191,7 @@ fn choose(
 ) -> Result<(vk::PhysicalDevice, DeviceInfo)> {
     let names = || {
         if all.is_empty() {
-            format!("the Vulkan loader finds no device: install a driver ({DRIVER_PACKAGES})")
+            format!("the Vulkan loader finds no device. {}", remedy())
         } else {
             let one = |d: &DeviceInfo| match &d.unusable {
                 None => format!("{} = {}", d.index, d.name),

@@ -70,10 +70,28 @@ fn load(loader: Option<Loader>) -> Result<ash::Entry> {
 fn no_instance(code: vk::Result) -> Error {
     Error::NoDevice(match code {
         vk::Result::ERROR_INCOMPATIBLE_DRIVER => {
-            format!("the Vulkan loader finds no driver. Install one ({DRIVER_PACKAGES})")
+            format!("the Vulkan loader finds no driver. {}", remedy())
         }
         code => format!("vkCreateInstance failed: {code}"),
     })
+}
+
+/// Variables by which the loader uses some drivers only.
+const DRIVER_VARIABLES: [&str; 4] =
+    ["VK_DRIVER_FILES", "VK_ICD_FILENAMES", "VK_LOADER_DRIVERS_SELECT", "VK_LOADER_DRIVERS_DISABLE"];
+
+/// Returns advice for a loader without drivers: variables that hide them, or else packages.
+pub(crate) fn remedy() -> String {
+    let set = |name: &&str| std::env::var_os(name).filter(|value| !value.is_empty());
+    let hiding = DRIVER_VARIABLES.iter().filter_map(|name| Some((name, set(name)?)));
+    let hiding: Vec<String> = hiding.map(|(name, value)| format!("{name}={}", value.to_string_lossy())).collect();
+    match hiding.is_empty() {
+        true => format!("Install one ({DRIVER_PACKAGES})"),
+        false => format!(
+            "The environment hides all drivers but those that it names ({}): correct or unset it",
+            hiding.join(", ")
+        ),
+    }
 }
 
 /// Tells whether the loader hides drivers such as MoltenVK from applications that do not ask for them.
