@@ -107,6 +107,7 @@ pub mod kernels {
 
 /// Angiograms with their geometry and phase.
 pub mod scan {
+    pub mod at_rest;
     mod builder;
     pub mod canvas;
     pub mod dataset;
@@ -124,6 +125,7 @@ pub mod scan {
 #[cfg(feature = "dicom")]
 pub mod import {
     pub mod angiograms;
+    mod beats;
     mod codecs;
     pub mod dicom;
     pub mod ecg;
@@ -132,8 +134,10 @@ pub mod import {
     mod frames;
     pub mod image_beat;
     pub mod intake;
+    pub mod pictures;
     mod reader;
     mod stands;
+    pub mod stated;
     mod timing;
     mod traces;
 }

@@ -45,6 +45,11 @@ pub struct Model {
 }
 
 impl Model {
+    /// Number of phases to show: those of the beat, or only the first for an object at rest.
+    pub fn shown_phases(&self) -> u32 {
+        if self.scene.still { 1 } else { self.param_map.phases as u32 }
+    }
+
     /// Tells whether the dynamic field has values between phases, as a network or one moving set of Gaussians has. Sets per
     /// phase and fields of methods with a module of their own have none.
     pub fn is_continuous(&self) -> bool {

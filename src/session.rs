@@ -381,7 +381,7 @@ impl Session {
         let (gpu, tuning) = self.shared.device()?;
         let model = self.checkpoint()?.model;
         let renderer = Renderer::new(gpu, &model, tuning.clone())?;
-        let phases = (0..model.param_map.phases as u32).collect();
+        let phases = (0..model.shown_phases()).collect();
         vessel_trees(&renderer, &model, &TreeOptions { phases, threshold_per_mm, least_branch_mm }, |_, _| Ok(()))
     }
 

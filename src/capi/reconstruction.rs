@@ -72,6 +72,7 @@ fn session(context: &Context, mut options: Options) -> Outcome<Session> {
         phases: phases.ok_or_else(|| Failure::argument("phases", "is missing: give the number of cardiac phases"))?,
         depth_half_extent_mm: depth.unwrap_or(100.0),
         vessel_attenuation_per_mm: vessel,
+        still: false,
         deterministic: context.deterministic,
     };
     Ok(Session::new(context.gpu.clone(), context.tuning.clone(), options)?)

@@ -62,6 +62,7 @@ impl Scene {
             dynamic_weight: 1.0,
             robust_scale: 0.0,
             region: None,
+            still: dataset.still,
         };
         if config.loss.normalise {
             scene.normalise(config, dataset, motion, static_half)?;
@@ -228,6 +229,7 @@ mod tests {
             depth_range: (-0.9, 0.9),
             hidden: Default::default(),
             vessel_attenuation: None,
+            still: false,
         }
     }
 

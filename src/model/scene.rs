@@ -40,6 +40,10 @@ pub struct Scene {
     /// as those of two networks do; none where the region is the boxes, and in older checkpoints.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub region: Option<[[f64; 3]; 2]>,
+    /// Whether the object is at rest: phase 0 shows it, and phase 1 is the same without vessels (see
+    /// [`crate::scan::dataset::Dataset::still`]).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub still: bool,
 }
 
 impl Scene {

@@ -19,7 +19,7 @@ use crate::raster::Image;
 use crate::scan::dataset::{Layout, MANIFEST, Split};
 use crate::scan::nerfca;
 use crate::scan::truth::{TrueFrame, Truth};
-use crate::scan::writer::{About, Writer};
+use crate::scan::writer::{About, Writer, authors_angles};
 use crate::score::volume::VOLUMES;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -96,6 +96,8 @@ pub struct VolumeOptions {
     pub scale: f32,
     /// Attenuation threshold above which a voxel belongs to a vessel, 1/mm.
     pub vessel_per_mm: Option<f64>,
+    /// Whether the object is at rest: one volume, and a dataset that says so.
+    pub still: bool,
     /// C-arms.
     pub c_arms: CArmOptions,
     /// Columns and rows of the images.
@@ -118,6 +120,7 @@ struct Stage {
     depth_half_extent_mm: f64,
     vessel_attenuation: Option<f64>,
     phases: u32,
+    still: bool,
     subject: Box<dyn Subject>,
     /// Whether the moving background already contains the vessels.
     vessels_in_background: bool,
@@ -192,6 +195,13 @@ pub fn project_volumes(
         return Err(Error::config("vessel_per_mm", options.vessel_per_mm.unwrap_or_default(), "is not positive"));
     }
     check_vessels(&options.degradations, options.vessel_per_mm)?;
+    if options.still && options.volumes.len() != 1 {
+        let problem = "volumes are given, but an object at rest has one";
+        return Err(Error::config("still", options.volumes.len(), problem));
+    }
+    if options.still && options.layout == Layout::Nerfca {
+        return Err(Error::config("layout", "nerfca", "cannot state that the object is at rest"));
+    }
     if options.volumes.is_empty() {
         return Err(Error::config("volumes", 0, "at least one volume, for one phase, is needed"));
     }
@@ -215,6 +225,7 @@ pub fn project_volumes(
         c_arms,
         vessel_attenuation: options.vessel_per_mm,
         phases: total as u32,
+        still: options.still,
         subject: Box::new(volumes),
         vessels_in_background: true,
     };
@@ -389,9 +400,14 @@ fn shoot(
         phases: stage.phases,
         depth_half_extent_mm: stage.depth_half_extent_mm,
         vessel_attenuation_per_mm: stage.vessel_attenuation,
+        still: stage.still,
         size: [size, size],
         c_arm: stage.c_arms[0].clone(),
     };
+    if shooting.layout == Layout::Nerfca {
+        let geometry = |c_arm: &CArm| Geometry::CArm(c_arm.clone());
+        stage.c_arms.iter().try_for_each(|c_arm| authors_angles(&about.c_arm, &geometry(c_arm)).map(drop))?;
+    }
     let mut writer = Writer::new(out, shooting.layout, about)?;
     let mut truth = Truth::new(shooting.seed, stage.phases);
     let mut camera = Camera::new(projector, stage, size)?;
@@ -482,6 +498,7 @@ fn procedural(options: &PhantomOptions) -> Result<Stage> {
         c_arms,
         vessel_attenuation: Some(tissues.vessel),
         phases: options.phases,
+        still: false,
         subject: Box::new(thorax),
         vessels_in_background: false,
     })
@@ -508,6 +525,7 @@ fn from_files(options: &PhantomOptions, anatomy: &Anatomy) -> Result<(Stage, Vec
         c_arms,
         vessel_attenuation: Some(vessel_per_mm),
         phases: options.phases,
+        still: false,
         subject: Box::new(patient),
         vessels_in_background: false,
     };

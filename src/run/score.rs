@@ -156,7 +156,8 @@ impl<'a> Beats<'a> {
 
     /// Views and phases without a validation frame.
     fn missing(&self, dataset: &Dataset) -> Vec<(usize, u32)> {
-        let every = self.views.iter().flat_map(|view| (0..dataset.n_phases).map(move |phase| (*view, phase)));
+        let n_phases = dataset.shown_phases();
+        let every = self.views.iter().flat_map(|view| (0..n_phases).map(move |phase| (*view, phase)));
         let seen = |at: &(usize, u32)| dataset.validation().iter().any(|f| (f.view, f.phase) == *at);
         every.filter(|at| !seen(at)).collect()
     }
@@ -169,7 +170,8 @@ impl<'a> Beats<'a> {
             pace.one_more()?;
         }
         for (index, view) in self.views.iter().enumerate() {
-            let beat: Vec<Vec<f32>> = (0..dataset.n_phases).filter_map(|p| self.images.remove(&(*view, p))).collect();
+            let beat: Vec<Vec<f32>> =
+                (0..dataset.shown_phases()).filter_map(|p| self.images.remove(&(*view, p))).collect();
             let high = beat.iter().flatten().copied().fold(f32::MIN_POSITIVE, f32::max);
             let path = self.directory.join(format!("beat-view{index}.gif"));
             pictures::write_gif(&path, &beat, dataset.views[*view].size[0], Window { low: 0.0, high: 0.8 * high }, 90)?;

@@ -1,8 +1,9 @@
 //! Collects the frames of a dataset that is read, and checks each one.
 
 use crate::error::{Error, Result};
-use crate::geometry::Geometry;
+use crate::geometry::{Geometry, MM_PER_UNIT};
 use crate::raster::Image;
+use crate::scan::at_rest::{self, WIDEST_VESSEL_MM, vessel_pixels, without_vessels};
 use crate::scan::canvas::onto_canvas;
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use crate::scan::frame_checks::{Complaint, check_phase, check_values};
@@ -21,6 +22,7 @@ pub(super) struct Builder {
     n_phases: u32,
     depth_range: (f64, f64),
     vessel_attenuation: Option<f64>,
+    still: bool,
     views: Vec<View>,
     frames: Vec<Frame>,
     pub(super) notes: Vec<String>,
@@ -60,10 +62,27 @@ impl Builder {
             n_phases,
             depth_range,
             vessel_attenuation,
+            still: false,
             views: Vec::new(),
             frames: Vec::new(),
             notes: Vec::new(),
         })
+    }
+
+    /// States that the object is at rest.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for more phases than an object at rest has.
+    pub(super) fn at_rest(&mut self) -> Result<()> {
+        if self.n_phases > at_rest::PHASES {
+            let problem = format!(
+                "is {}, but an object at rest has phase 0 and, where they are known, images without vessels as phase 1",
+                self.n_phases
+            );
+            return Err(Error::data(&self.file, "phases", problem));
+        }
+        (self.still, self.n_phases) = (true, at_rest::PHASES);
+        Ok(())
     }
 
     pub(super) fn add<F: Fn(f32) -> f32>(&mut self, new: NewFrame<'_, F>) -> Result<()> {
@@ -79,6 +98,13 @@ impl Builder {
         };
         check_phase(new.time_phases, self.n_phases).map_err(|c| told(&self.file, c))?;
         let taken = BeatTime::of(new.time_phases, self.n_phases);
+        if self.still && taken.after_phase != 0.0 {
+            return Err(Error::data(
+                &self.file,
+                field("phase"),
+                "lies between two phases, which an object at rest does not",
+            ));
+        }
         let size = [new.image.width, new.image.height];
         check_values(&new.image.values, size[0]).map_err(|c| told(new.source, c))?;
         let of_geometry = |c: Complaint| Complaint { field: format!("geometry.{}", c.field), ..c };
@@ -100,7 +126,48 @@ impl Builder {
         Ok(())
     }
 
+    /// Adds a training frame of phase 1 for each view of an object at rest that has none: the mean of its images without
+    /// structures as thin as vessels.
+    fn add_appearance_without_vessels(&mut self) {
+        let mut made = 0;
+        for (index, view) in self.views.iter().enumerate() {
+            let of_view = |phase: u32| {
+                let used = move |f: &&Frame| (f.view, f.split, f.phase) == (index, Split::Train, phase);
+                self.frames.iter().filter(used)
+            };
+            let shown: Vec<&Frame> = of_view(0).collect();
+            if shown.is_empty() || of_view(1).next().is_some() {
+                continue;
+            }
+            let [width, height] = view.size;
+            let mut mean = Image::zeros(width, height);
+            for frame in &shown {
+                mean.values.iter_mut().zip(&frame.integrals).for_each(|(sum, v)| *sum += v / shown.len() as f32);
+            }
+            let pixel_mm = view.rays.direction[1].length() * view.rays.sod * MM_PER_UNIT;
+            let background = without_vessels(&mean, vessel_pixels(pixel_mm), f32::INFINITY);
+            let frame = Frame {
+                name: format!("{}-without-vessels", shown[0].name),
+                phase: 1,
+                integrals: background.values,
+                mask: None,
+                ..shown[0].clone()
+            };
+            self.frames.push(frame);
+            made += 1;
+        }
+        if made > 0 {
+            self.notes.push(format!(
+                "the object is at rest: the appearance of {made} views without vessels was estimated from their images, \
+                 without structures up to {WIDEST_VESSEL_MM} mm wide"
+            ));
+        }
+    }
+
     pub(super) fn finish(mut self, path: &Path, layout: Layout) -> Result<Dataset> {
+        if self.still {
+            self.add_appearance_without_vessels();
+        }
         let canvas = onto_canvas(&self.views, &mut self.frames);
         let canvas = canvas.map_err(|c| Error::data(&self.file, "frames", format!("{}: {}", c.value, c.problem)))?;
         let Some([width, height]) = canvas else {
@@ -122,6 +189,7 @@ impl Builder {
             n_phases: self.n_phases,
             depth_range: self.depth_range,
             vessel_attenuation: self.vessel_attenuation,
+            still: self.still,
             notes: self.notes,
         };
         dataset.hide();

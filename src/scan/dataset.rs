@@ -94,6 +94,10 @@ pub struct Manifest {
     /// Attenuation of contrast-filled vessels, 1/mm, where known; a fifth of it is the Dice threshold.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub vessel_attenuation_per_mm: Option<f64>,
+    /// Whether the object is at rest: phase 0 shows it, and phase 1 is the same without vessels. Phase 1 is estimated for views
+    /// without an image of it, from their images of phase 0. `phases` is 1 or 2.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub still: bool,
     /// All images.
     pub frames: Vec<ManifestFrame>,
 }
@@ -221,11 +225,18 @@ pub struct Dataset {
     pub depth_range: (f64, f64),
     /// Vessel attenuation per world unit, where stated.
     pub vessel_attenuation: Option<f64>,
+    /// Whether the object is at rest: phase 0 shows it, and phase 1 is the same without vessels.
+    pub still: bool,
     /// Findings on reading that are no errors but may be unintended.
     pub notes: Vec<String>,
 }
 
 impl Dataset {
+    /// Number of phases to show: those of the beat, or only the first for an object at rest.
+    pub fn shown_phases(&self) -> u32 {
+        if self.still { 1 } else { self.n_phases }
+    }
+
     /// Rays that see the heart in a frame: the view's rays, displaced opposite to the heart.
     pub fn heart_rays(&self, frame: &Frame) -> ViewRays {
         self.views[frame.view].rays.moved(frame.heart_shift())

@@ -7,9 +7,19 @@ use crate::geometry::MM_PER_UNIT;
 use crate::scan::builder::{Builder, NewFrame};
 use crate::scan::dataset::{Dataset, Layout, MANIFEST, Manifest};
 use crate::scan::nerfca;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 const MAX_MANIFEST_BYTES: u64 = 256 << 20;
+
+/// Path of a file that a manifest names. A name with backslashes, as other systems write it, also means the file in that folder,
+/// unless there is a file of exactly this name.
+fn found(dataset: &Path, name: &Path) -> PathBuf {
+    let path = dataset.join(name);
+    match name.to_str() {
+        Some(text) if text.contains('\\') && !path.exists() => dataset.join(text.replace('\\', "/")),
+        _ => path,
+    }
+}
 
 impl Dataset {
     /// Reads a dataset and detects its layout.
@@ -35,9 +45,7 @@ impl Dataset {
 
     fn open_native(path: &Path) -> Result<Dataset> {
         let file = path.join(MANIFEST);
-        let text = files::read_limited(&file, MAX_MANIFEST_BYTES)?;
-        let manifest: Manifest = serde_json::from_slice(&text)
-            .map_err(|e| Error::data(&file, format!("line {}", e.line()), e.to_string()))?;
+        let manifest: Manifest = files::read_json(&file, MAX_MANIFEST_BYTES)?;
         if manifest.format != "nertca-dataset" || manifest.version != 1 {
             return Err(Error::data(
                 &file,
@@ -54,17 +62,20 @@ impl Dataset {
         }
         let vessel = manifest.vessel_attenuation_per_mm.map(|a| a * MM_PER_UNIT);
         let mut builder = Builder::new(&file, manifest.phases, (-half, half), vessel)?;
+        if manifest.still {
+            builder.at_rest()?;
+        }
         for (index, frame) in manifest.frames.iter().enumerate() {
             frame
                 .intensity
                 .check()
                 .map_err(|(field, problem)| Error::data(&file, format!("frames[{index}].{field}"), problem))?;
-            let image_path = path.join(&frame.image);
+            let image_path = found(path, &frame.image);
             let image = images::read_image(&image_path)?;
             let mask = match &frame.mask {
                 None => None,
                 Some(name) => {
-                    let mask = images::read_image(&path.join(name))?;
+                    let mask = images::read_image(&found(path, name))?;
                     if (mask.width, mask.height) != (image.width, image.height) {
                         return Err(Error::data(path.join(name), "shape", "differs from the shape of its image"));
                     }

@@ -27,6 +27,8 @@ pub struct About {
     pub depth_half_extent_mm: f64,
     /// Attenuation of filled vessels, 1/mm, where known.
     pub vessel_attenuation_per_mm: Option<f64>,
+    /// Whether the object is at rest (see [`Manifest::still`]); the authors' layout cannot state it.
+    pub still: bool,
     /// Columns and rows of all images in the authors' layout, which states one size for all.
     pub size: [usize; 2],
     /// C-arm that gives the distances and pixels of the authors' layout, which states them once for all views.
@@ -68,6 +70,7 @@ impl<'a> Writer<'a> {
                 phases: about.phases,
                 depth_half_extent_mm: about.depth_half_extent_mm,
                 vessel_attenuation_per_mm: about.vessel_attenuation_per_mm,
+                still: about.still,
                 frames: Vec::new(),
             },
             general: nerfca::General {
@@ -145,7 +148,7 @@ impl<'a> Writer<'a> {
                         values.iter().zip(mask).map(|(v, m)| if *m { *v } else { I0_LOG as f32 }).collect();
                     npy::write(&self.out.join(&mask_file), &[height, width], &masked)?;
                 }
-                let (theta, phi) = self.authors_angles(geometry)?;
+                let (theta, phi) = authors_angles(&self.c_arm, geometry)?;
                 self.lists[usize::from(split == Split::Validation)].push(nerfca::FrameEntry {
                     file_path: file.clone(),
                     img_min_max: [f64::from(low), f64::from(high).max(f64::from(low) + 1e-12)],
@@ -167,38 +170,13 @@ impl<'a> Writer<'a> {
     /// # Errors
     /// [`Error::Config`] where the layout cannot state a displacement.
     pub fn corrected(&mut self, heart_shift_mm: [f64; 3], stated: Option<&Geometry>) -> Result<()> {
-        if self.layout == Layout::Nerfca && heart_shift_mm != [0.0; 3] {
-            return Err(Error::config(
-                "layout",
-                "nerfca",
-                "does not support displacements of the heart, which this dataset has",
-            ));
+        if self.layout == Layout::Nerfca {
+            check_shift(heart_shift_mm)?;
         }
         if let Some(frame) = self.manifest.frames.last_mut() {
             (frame.heart_shift_mm, frame.stated_geometry) = (heart_shift_mm, stated.cloned());
         }
         Ok(())
-    }
-
-    /// Angles of a geometry that may differ from the common one only in its angles.
-    fn authors_angles(&self, geometry: &Geometry) -> Result<(f64, f64)> {
-        let c_arm = match geometry {
-            Geometry::CArm(c_arm) => c_arm,
-            Geometry::Matrix(_) => {
-                return Err(Error::config(
-                    "layout",
-                    "nerfca",
-                    "does not support projection matrices, only angles and distances",
-                ));
-            }
-        };
-        let common = CArm { primary_deg: c_arm.primary_deg, secondary_deg: c_arm.secondary_deg, ..self.c_arm.clone() };
-        if *c_arm != common {
-            let problem = "supports the same distances, pixels and table position for all views only, and they differ \
-                           in this dataset";
-            return Err(Error::config("layout", "nerfca", problem));
-        }
-        Ok((c_arm.primary_deg, c_arm.secondary_deg))
     }
 
     /// Writes the files that list the frames; from then on the dataset is complete.
@@ -214,12 +192,43 @@ impl<'a> Writer<'a> {
             Layout::Native => write(MANIFEST, serde_json::to_string_pretty(&self.manifest)),
             Layout::Nerfca => {
                 let [train, test] = self.lists;
-                write("train-0.json", serde_json::to_string_pretty(&nerfca::FrameList { frames: train }))?;
-                write("test-0.json", serde_json::to_string_pretty(&nerfca::FrameList { frames: test }))?;
+                write(nerfca::TRAINING_LIST, serde_json::to_string_pretty(&nerfca::FrameList { frames: train }))?;
+                write(nerfca::VALIDATION_LIST, serde_json::to_string_pretty(&nerfca::FrameList { frames: test }))?;
                 write(nerfca::GENERAL, serde_json::to_string_pretty(&self.general))
             }
         }
     }
+}
+
+/// Rejects a displacement of the heart, which the authors' layout cannot state.
+fn check_shift(heart_shift_mm: [f64; 3]) -> Result<()> {
+    if heart_shift_mm == [0.0; 3] {
+        return Ok(());
+    }
+    let problem = "does not support displacements of the heart, which this dataset has";
+    Err(Error::config("layout", "nerfca", problem))
+}
+
+/// Returns the angles of a geometry that differs from that of the C-arm `common` at most in its angles, as the authors' layout
+/// requires it.
+///
+/// # Errors
+/// [`Error::Config`] for another geometry.
+pub fn authors_angles(common: &CArm, geometry: &Geometry) -> Result<(f64, f64)> {
+    let c_arm = match geometry {
+        Geometry::CArm(c_arm) => c_arm,
+        Geometry::Matrix(_) => {
+            let problem = "does not support projection matrices, only angles and distances";
+            return Err(Error::config("layout", "nerfca", problem));
+        }
+    };
+    let common = CArm { primary_deg: c_arm.primary_deg, secondary_deg: c_arm.secondary_deg, ..common.clone() };
+    if *c_arm != common {
+        let problem = "supports the same distances, pixels and table position for all views only, and they differ in this \
+                       dataset";
+        return Err(Error::config("layout", "nerfca", problem));
+    }
+    Ok((c_arm.primary_deg, c_arm.secondary_deg))
 }
 
 /// Writes a dataset in a layout. Stored values become line integrals.
@@ -249,6 +258,12 @@ pub fn write(
     if layout == Layout::Nerfca && dataset.sizes().len() > 1 {
         return Err(Error::config("layout", "nerfca", ONE_SIZE));
     }
+    if layout == Layout::Nerfca {
+        // Nothing is written of a dataset that the layout cannot hold.
+        let common = dataset.reference_c_arm();
+        dataset.views.iter().try_for_each(|view| authors_angles(&common, &view.geometry).map(drop))?;
+        dataset.frames.iter().try_for_each(|frame| check_shift(frame.heart_shift_mm))?;
+    }
     let mut writer = Writer::new(
         out,
         layout,
@@ -257,6 +272,7 @@ pub fn write(
             phases: dataset.n_phases,
             depth_half_extent_mm: low.abs().max(high.abs()) * MM_PER_UNIT,
             vessel_attenuation_per_mm: dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),
+            still: dataset.still,
             size: dataset.canvas(),
             c_arm: dataset.reference_c_arm(),
         },

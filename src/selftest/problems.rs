@@ -79,6 +79,7 @@ pub fn small_dataset(width: usize, height: usize, n_phases: u32) -> Result<Datas
         depth_range: (-0.9, 0.9),
         hidden: Default::default(),
         vessel_attenuation: Some(1.0),
+        still: false,
         notes: Vec::new(),
     })
 }

@@ -21,6 +21,8 @@ pub struct SessionOptions {
     pub depth_half_extent_mm: f64,
     /// Attenuation of contrast-filled vessels, 1/mm, where known; a fifth of it is the Dice threshold.
     pub vessel_attenuation_per_mm: Option<f64>,
+    /// Whether the object is at rest: frames of phase 0 show it, and those of phase 1 the same without vessels, of two phases.
+    pub still: bool,
     /// Refuse frames while training in the background, so that results never depend on timing.
     pub deterministic: bool,
 }
@@ -179,6 +181,7 @@ impl Inbox {
             n_phases: self.options.phases,
             depth_range: (-half, half),
             vessel_attenuation: self.options.vessel_attenuation_per_mm.map(|a| a * MM_PER_UNIT),
+            still: self.options.still,
             notes: Vec::new(),
         };
         dataset.hide();

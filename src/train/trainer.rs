@@ -338,6 +338,7 @@ mod tests {
             depth_range: (-1.0, 1.0),
             hidden: Default::default(),
             vessel_attenuation: None,
+            still: false,
         }
     }
 

@@ -154,6 +154,7 @@ impl Studio {
             depth_range: (-1.26, 1.26),
             hidden: Default::default(),
             vessel_attenuation: Some(Tissues::XCAT.vessel * 100.0),
+            still: false,
             notes: Vec::new(),
         }
     }

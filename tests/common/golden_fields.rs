@@ -160,6 +160,7 @@ impl Golden {
             dynamic_weight: n("dynamic_weight"),
             robust_scale: n("robust_scale"),
             region: None,
+            still: false,
         }
     }
 }

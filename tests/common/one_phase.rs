@@ -40,5 +40,6 @@ pub fn dataset(angles: &[[f64; 2]], [width, height]: [usize; 2], image: impl Fn(
         depth_range: (-0.5, 0.5),
         hidden: Default::default(),
         vessel_attenuation: None,
+        still: false,
     }
 }

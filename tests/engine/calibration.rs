@@ -216,6 +216,7 @@ fn a_session_tells_how_it_sees_its_frames() {
         phases: PHASES,
         depth_half_extent_mm: shot.dataset.depth_range.1 * MM_PER_UNIT,
         vessel_attenuation_per_mm: shot.dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),
+        still: false,
         deterministic: true,
     };
     let session = Session::new(Some(gpu.clone()), Some(tuning(&gpu)), options).unwrap();

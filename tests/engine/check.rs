@@ -93,6 +93,7 @@ fn angiograms_of(angles: &[(f64, f64)], flaws: Flaws, vessels: &[Vec<(DVec3, f64
         depth_range: (-1.0, 1.0),
         hidden: Default::default(),
         vessel_attenuation: None,
+        still: false,
         notes: Vec::new(),
     }
 }

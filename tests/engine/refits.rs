@@ -53,6 +53,7 @@ fn session_of(gpu: &Gpu, dataset: &Dataset, form: GaussianForm, iterations: u32)
         phases: PHASES,
         depth_half_extent_mm: dataset.depth_range.1 * MM_PER_UNIT,
         vessel_attenuation_per_mm: dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),
+        still: false,
         deterministic: true,
     };
     Session::new(Some(gpu.clone()), Some(tuning(gpu)), options).unwrap()

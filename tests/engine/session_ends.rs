@@ -45,6 +45,7 @@ fn who_waited_for_the_end_may_start_and_train_at_once() {
         phases: dataset.n_phases,
         depth_half_extent_mm: 100.0,
         vessel_attenuation_per_mm: None,
+        still: false,
         deterministic: true,
     };
     let session = Session::new(Some(gpu.clone()), Some(tuning(&gpu)), options).unwrap();

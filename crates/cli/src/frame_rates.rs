@@ -37,7 +37,7 @@ pub fn measure_frame_rates(
         for &size in sizes {
             let frame = |i: u32| {
                 let viewpoint = viewpoint(model, f64::from(i * 7 % 180) - 90.0, 10.0, [size, size])?;
-                let phase = i % model.param_map.phases as u32;
+                let phase = i % model.shown_phases();
                 match way {
                     "fields" => renderer.show(&viewpoint.rays, (size, size), phase, quantity),
                     _ => baked.render(&viewpoint.rays, size, size, phase, quantity),

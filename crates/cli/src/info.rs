@@ -5,11 +5,12 @@ use clap::Args;
 use nertca_vk::checkpoint::{self, Checkpoint};
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
-use nertca_vk::files::pretty_json;
+use nertca_vk::files::{path_in_json, pretty_json};
 use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::scan::dataset::{Dataset, Split, manifest_schema};
 use nertca_vk::score::pictures::Window;
+use serde::Serialize;
 use std::path::{Path, PathBuf};
 
 /// Arguments of `info`.
@@ -61,11 +62,12 @@ fn describe_run(path: &Path) -> Result<serde_json::Value> {
     let model = Checkpoint::read(&file)?.model;
     let mut described = serde_json::json!({
         "kind": "run",
-        "checkpoint": file,
+        "checkpoint": Stored(&file),
         "step": model.step,
         "iterations": model.config.train.iterations,
         "parameters": model.param_map.len,
-        "phases": model.param_map.phases,
+        "phases": model.shown_phases(),
+        "still": model.scene.still,
         "hull_share": model.hull.as_ref().map(|h| h.share()),
         "gaussians": model.gaussians.as_ref().map(describe_gaussians),
         "scene": model.scene,
@@ -76,6 +78,10 @@ fn describe_run(path: &Path) -> Result<serde_json::Value> {
     }
     Ok(described)
 }
+
+/// A path, as JSON.
+#[derive(Serialize)]
+struct Stored<'a>(#[serde(serialize_with = "path_in_json::serialize")] &'a Path);
 
 fn describe_gaussians(field: &DynamicGaussians) -> serde_json::Value {
     let phases = 0..field.rows().n_phases;
@@ -109,7 +115,8 @@ fn describe_dataset(path: &Path) -> Result<serde_json::Value> {
         "kind": "dataset",
         "layout": dataset.layout,
         "image": dataset.canvas(),
-        "phases": dataset.n_phases,
+        "phases": dataset.shown_phases(),
+        "still": dataset.still,
         "depth_range_mm": [dataset.depth_range.0 * MM_PER_UNIT, dataset.depth_range.1 * MM_PER_UNIT],
         "line_integrals": [range.low, range.high],
         "vessel_attenuation_per_mm": dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),

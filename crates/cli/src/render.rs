@@ -92,7 +92,7 @@ const MIN_MS: u32 = 20;
 /// Writes frames as an angiogram of a heart of 68 beats per minute; the true heart rate is not stored.
 fn write_dicom(args: &RenderArgs, out: &Path, model: &Model, viewpoint: &Viewpoint, frames: &[Vec<f32>]) -> Result<()> {
     let size = [viewpoint.width, viewpoint.height];
-    let beat_frames = model.param_map.phases as u32 * (args.between + 1);
+    let beat_frames = model.shown_phases() * (args.between + 1);
     let mut seeds = [[0u8; 16]; 3];
     for seed in &mut seeds {
         getrandom::fill(seed).map_err(|e| Error::Internal(format!("random numbers could not be obtained: {e}")))?;
@@ -115,7 +115,10 @@ fn write_dicom(args: &RenderArgs, out: &Path, model: &Model, viewpoint: &Viewpoi
 
 /// Returns the moments of the beat that `--phase` and `--between` name.
 fn moments(args: &RenderArgs, model: &Model) -> Result<Vec<f64>> {
-    let n_phases = model.param_map.phases as u32;
+    let n_phases = model.shown_phases();
+    if model.scene.still && args.between > 0 {
+        return Err(Error::config("--between", args.between, "an object at rest has one phase only"));
+    }
     let between = args.between + 1;
     if args.phase == "all" {
         return Ok((0..n_phases * between).map(|i| f64::from(i) / f64::from(between)).collect());
@@ -124,7 +127,7 @@ fn moments(args: &RenderArgs, model: &Model) -> Result<Vec<f64>> {
         return Err(Error::config("--between", args.between, "pictures between phases need --phase all"));
     }
     // A continuous beat is periodic: its end equals its beginning.
-    let last = if model.is_continuous() { n_phases } else { n_phases - 1 };
+    let last = if model.is_continuous() && !model.scene.still { n_phases } else { n_phases - 1 };
     match args.phase.parse::<f64>() {
         Ok(phase) if (0.0..=f64::from(last)).contains(&phase) => Ok(vec![phase]),
         _ => Err(Error::config("--phase", &args.phase, format!("is neither `all` nor a phase from 0 to {last}"))),

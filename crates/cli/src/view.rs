@@ -47,7 +47,7 @@ impl PictureSource for Finished {
     }
 
     fn phases(&self) -> u32 {
-        self.model.param_map.phases as u32
+        self.model.shown_phases()
     }
 
     fn about(&self) -> Value {
@@ -73,7 +73,7 @@ pub fn view(global: &GlobalOptions, args: &ViewArgs) -> Result<()> {
     let gpu = global.open_device()?;
     let tuning = global.tuning(&gpu, &model.config);
     let renderer = Arc::new(Renderer::new(&gpu, &model, tuning.clone())?);
-    eprintln!("preparing {} phases on {} ...", model.param_map.phases, gpu.info().name);
+    eprintln!("preparing {} phases on {} ...", model.shown_phases(), gpu.info().name);
     let mut shown = Finished {
         taken: AngiogramGeometry { c_arm: model.c_arm.clone(), image_size: model.image_size },
         baked: Mutex::new(Baked::for_display(renderer, &model, CELL_MM)),

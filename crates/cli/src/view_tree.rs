@@ -109,7 +109,7 @@ impl TreeWork {
     fn tree(&self, generation: u64, model: &Model) -> Result<String> {
         // The search has its own renderer, because the viewer's renderer goes on drawing pictures.
         let renderer = Renderer::new(&self.gpu, model, self.tuning.clone())?;
-        let phases = (0..model.param_map.phases as u32).collect();
+        let phases = (0..model.shown_phases()).collect();
         let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };
         let beat = vessel_trees(&renderer, model, &options, |done, of| {
             let wanted = self.tell(generation, TreeState::Working { done, of });
