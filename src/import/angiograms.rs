@@ -3,22 +3,21 @@
 use crate::error::{Error, Result};
 use crate::geometry::CArm;
 use crate::import::dicom::{PixelRange, Relationship, Run};
-use crate::import::image_beat;
 use crate::import::stands::stands;
-use crate::raster::{Image, dilate, opening, percentile};
+use crate::import::{beats, image_beat};
+use crate::raster::Image;
+use crate::scan::at_rest::{WIDEST_VESSEL_MM, vessel_pixels, without_vessels};
 use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
 
-/// Width of the widest vessel that is searched, mm at the isocentre.
-const WIDEST_VESSEL_MM: f64 = 6.0;
 /// Share of the strongest contrast above which a frame counts as filled.
 const FILLED_SHARE: f64 = 0.6;
-/// Threshold for structures that stand out, in standard deviations of the noise.
-const NOISE_SIGMAS: f32 = 4.0;
 /// Line integral that corresponds to the full range of display grey values.
 const DISPLAY_SPAN: f64 = 3.0;
+/// Line integral from which an area belongs to the collimator or the detector's rim.
+const DARK: f32 = (0.85 * DISPLAY_SPAN) as f32;
 
 /// Source of the phases.
 #[derive(Debug, Clone)]
@@ -53,6 +52,8 @@ pub struct ImportOptions {
     pub pixel_mm: Option<[f64; 2]>,
     /// Longest side of the images, pixels; larger images are reduced by averaging.
     pub size: Option<usize>,
+    /// Whether frames of one phase from several beats are averaged; otherwise each phase is taken from one beat.
+    pub all_beats: bool,
     /// Depth searched before and behind the isocentre, mm.
     pub depth_half_extent_mm: f64,
 }
@@ -130,7 +131,7 @@ impl Prepared {
         let c_arms: Vec<CArm> = run.c_arms.iter().map(kept).collect();
         let stands = stands(&c_arms, [width, height]);
         let at_isocentre = c_arms[0].pixel_mm[0] * c_arms[0].sod_mm / c_arms[0].sid_mm;
-        let vessel = ((0.5 * WIDEST_VESSEL_MM / at_isocentre).ceil() as usize).max(2);
+        let vessel = vessel_pixels(at_isocentre);
         let selected = select(run, &frames, vessel, options, &mut notes)?;
         let chosen = Chosen { run, frames: &frames, stands: &stands, selected: &selected, vessel };
         let views = chosen.stands_of(&selected).len();
@@ -173,6 +174,7 @@ impl Chosen<'_> {
         let none = |problem: &str| Error::data(&run.path, "phases", problem.to_owned());
         let from =
             |stand: usize, of: &[usize]| of.iter().copied().filter(|i| self.stands[*i] == stand).collect::<Vec<_>>();
+        let beat_of;
         let taken: Vec<Option<BeatTime>> = match &options.gating {
             Gating::Still => {
                 notes.push(format!(
@@ -183,7 +185,7 @@ impl Chosen<'_> {
                 ));
                 let of_stand = |stand: usize| {
                     let mean = mean(self.frames, &from(stand, selected));
-                    let background = without_vessels(&mean, self.vessel);
+                    let background = without_vessels(&mean, self.vessel, DARK);
                     [(BeatTime::at_phase(0), stand, mean), (BeatTime::at_phase(1), stand, background)]
                 };
                 return Ok(self.stands_of(selected).into_iter().flat_map(of_stand).collect());
@@ -192,16 +194,25 @@ impl Chosen<'_> {
                 if let Some(bad) = list.iter().find(|p| !(0.0..f64::from(n_phases)).contains(*p)) {
                     return Err(none(&format!("phase {bad} is given, but phases go from 0 to {}", n_phases - 1)));
                 }
+                beat_of = beats::numbers_of_list(list);
                 list.iter().map(|p| Some(BeatTime::of(*p, n_phases))).collect()
             }
             Gating::Phases(list) => {
                 return Err(none(&format!("{} phases are given for {} selected frames", list.len(), selected.len())));
             }
             timed => {
+                if run.times_s.len() != run.frames.len() {
+                    return Err(none(
+                        "the times of the frames are not known: state the frames per second, or a list of phases",
+                    ));
+                }
                 let peaks = self.r_peaks(timed, notes)?;
-                selected.iter().map(|i| peaks.beat_time(run.times_s[*i], n_phases, options.scaling)).collect()
+                let times_s: Vec<f64> = selected.iter().map(|i| run.times_s[*i]).collect();
+                beat_of = beats::numbers(&times_s, &peaks);
+                times_s.iter().map(|time| peaks.beat_time(*time, n_phases, options.scaling)).collect()
             }
         };
+        let taken = if options.all_beats { taken } else { self.of_one_beat(taken, &beat_of, notes) };
         let (mut images, mut seen) = (Vec::new(), 0);
         for phase in 0..n_phases {
             let timed = selected.iter().zip(&taken).filter_map(|(i, taken)| Some((*i, (*taken)?)));
@@ -209,7 +220,7 @@ impl Chosen<'_> {
             let frames: Vec<usize> = of_phase.keys().copied().collect();
             seen += usize::from(!frames.is_empty());
             for stand in self.stands_of(&frames) {
-                // Frames of the same phase may come from several beats.
+                // A phase may have several frames, also of several beats where those are averaged.
                 let frames = from(stand, &frames);
                 let after_phase = frames.iter().map(|i| of_phase[i].after_phase).sum::<f64>() / frames.len() as f64;
                 images.push((BeatTime { phase, after_phase }, stand, mean(self.frames, &frames)));
@@ -218,8 +229,37 @@ impl Chosen<'_> {
         if seen < 2 {
             return Err(none(&format!("only {seen} of {n_phases} phases are seen; at least two are needed")));
         }
-        notes.push(format!("{}: {seen} of {n_phases} phases from {} frames", run.name(), selected.len()));
+        notes.push(format!(
+            "{}: {seen} of {n_phases} phases from {} frames",
+            run.name(),
+            taken.iter().flatten().count()
+        ));
         Ok(images)
+    }
+
+    /// Forgets the times of frames whose phase is taken from another beat, so that they are not used.
+    fn of_one_beat(
+        &self,
+        taken: Vec<Option<BeatTime>>,
+        beat_of: &[usize],
+        notes: &mut Vec<String>,
+    ) -> Vec<Option<BeatTime>> {
+        let mut taken = taken;
+        // Frames of different poses are never averaged, so each pose has a choice of its own.
+        for stand in self.stands_of(self.selected) {
+            let of_stand: Vec<usize> =
+                (0..self.selected.len()).filter(|i| self.stands[self.selected[*i]] == stand).collect();
+            let beating = |i: &usize| beats::Beating {
+                image: &self.frames[self.selected[*i]],
+                time_s: self.run.times_s.get(self.selected[*i]).copied().unwrap_or(*i as f64),
+                taken: taken[*i],
+                beat: beat_of[*i],
+            };
+            let (used, note) = beats::choose(&of_stand.iter().map(beating).collect::<Vec<_>>(), self.vessel);
+            notes.extend(note.map(|note| format!("{}: {note}", self.run.name())));
+            of_stand.iter().zip(used).filter(|(_, used)| !used).for_each(|(i, _)| taken[*i] = None);
+        }
+        taken
     }
 
     /// Returns the R-peaks of the run from the requested source.
@@ -235,15 +275,20 @@ impl Chosen<'_> {
                     .map_err(|e| Error::data(&run.path, "phases", e.to_string()))?;
                 notes.push(format!(
                     "{}: {:.0} beats per minute, found in the images (the motion of the vessels has a correlation of \
-                     {:.2} with a contracting ventricle); a regular rhythm is assumed",
+                     {:.2} with a contracting ventricle){}; a regular rhythm is assumed",
                     run.name(),
                     found.beats_per_min,
-                    found.likeness
+                    found.likeness,
+                    if found.trend_degree > 0 {
+                        " after slow changes by contrast and breathing were removed"
+                    } else {
+                        ""
+                    }
                 ));
                 Ok(found.r_peaks)
             }
             _ => run.r_peaks.clone().ok_or_else(|| {
-                let problem = "the file has no ECG: give R-peaks, a heart rate or a list of phases, find the beat in \
+                let problem = "there is no ECG: give R-peaks, a heart rate or a list of phases, find the beat in \
                                the images, or state that the object is static";
                 Error::data(&run.path, "phases", problem)
             }),
@@ -282,14 +327,7 @@ fn select(
         return Ok((asked.start() - 1..*asked.end()).collect());
     }
     // Contrast of thin dark structures in each frame.
-    let contrast: Vec<f64> = frames
-        .par_iter()
-        .map(|frame| {
-            let background = opening(frame, vessel).values;
-            let stand_out: Vec<f32> = frame.values.iter().zip(&background).map(|(v, b)| (v - b).max(0.0)).collect();
-            f64::from(percentile(&stand_out, 0.98))
-        })
-        .collect();
+    let contrast: Vec<f64> = frames.par_iter().map(|frame| beats::contrast(frame, vessel)).collect();
     let max = contrast.iter().copied().fold(0.0, f64::max);
     // A frame that is not filled is appended to end a sequence that lasts to the last frame.
     let filled = contrast.iter().map(|c| *c >= FILLED_SHARE * max).chain([false]);
@@ -311,36 +349,6 @@ fn select(
         best.end
     ));
     Ok(best.collect())
-}
-
-/// Removes structures as thin as vessels: pixels that stand out of their surroundings by more than noise are set to the level
-/// of the surroundings.
-fn without_vessels(image: &Image, vessel: usize) -> Image {
-    let mut background = opening(image, vessel);
-    let stand_out: Vec<f32> = image.values.iter().zip(&background.values).map(|(v, b)| v - b).collect();
-    // An opening follows the minimum of the surroundings, which noise makes too small; the median difference corrects for that.
-    let typical = percentile(&stand_out, 0.5);
-    let spread = percentile(&stand_out.iter().map(|s| (s - typical).abs()).collect::<Vec<_>>(), 0.5);
-    let limit = typical + NOISE_SIGMAS * 1.4826 * spread;
-    let closed = closed(&background, 2 * vessel);
-    for (p, b) in background.values.iter_mut().enumerate() {
-        *b = if stand_out[p] > limit && !closed[p] { *b + typical } else { image.values[p] };
-    }
-    background
-}
-
-/// Pixels within `margin` of the image's edge, or of areas so dark that they belong to the collimator or the detector's rim,
-/// whose outlines are as thin as vessels.
-fn closed(background: &Image, margin: usize) -> Vec<bool> {
-    let (w, h) = (background.width, background.height);
-    let dark = background.values.iter().map(|v| f32::from(u8::from(f64::from(*v) > 0.85 * DISPLAY_SPAN))).collect();
-    let grown = dilate(&Image { values: dark, ..*background }, margin);
-    (0..w * h)
-        .map(|p| {
-            let (x, y) = (p % w, p / w);
-            grown.values[p] > 0.0 || x.min(w - 1 - x).min(y).min(h - 1 - y) < margin
-        })
-        .collect()
 }
 
 fn mean(frames: &[Image], which: &[usize]) -> Image {

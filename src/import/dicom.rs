@@ -8,6 +8,7 @@ use crate::import::elements::{self, Content, numbers};
 use crate::import::frames::{self, Layout};
 use crate::import::reader::Reader;
 use crate::import::{timing, traces};
+use crate::import::stated::StatedGeometry;
 use crate::scan::gating::RPeaks;
 use dicom_core::{Tag, VR};
 use dicom_dictionary_std::tags;
@@ -99,11 +100,12 @@ impl Reader<'_> {
         Ok(steps.iter().map(|step| base + step).collect())
     }
 
-    /// Distances from the source to the detector and to the patient, mm.
-    fn distances(&self, notes: &mut Vec<String>) -> Result<[f64; 2]> {
+    /// Distances from the source to the detector and to the patient, mm: those that the user states before those of the file.
+    fn distances(&self, stated: &StatedGeometry, notes: &mut Vec<String>) -> Result<[f64; 2]> {
         let positive = |tag, name| -> Result<Option<f64>> { Ok(self.number(tag, name)?.filter(|value| *value > 0.0)) };
-        let sid_mm = positive(tags::DISTANCE_SOURCE_TO_DETECTOR, "DistanceSourceToDetector")?;
-        let sod_mm = positive(tags::DISTANCE_SOURCE_TO_PATIENT, "DistanceSourceToPatient")?;
+        let or_file = |stated: Option<f64>, tag, name| stated.map_or_else(|| positive(tag, name), |mm| Ok(Some(mm)));
+        let sid_mm = or_file(stated.sid_mm, tags::DISTANCE_SOURCE_TO_DETECTOR, "DistanceSourceToDetector")?;
+        let sod_mm = or_file(stated.sod_mm, tags::DISTANCE_SOURCE_TO_PATIENT, "DistanceSourceToPatient")?;
         let factor =
             positive(tags::ESTIMATED_RADIOGRAPHIC_MAGNIFICATION_FACTOR, "EstimatedRadiographicMagnificationFactor")?;
         match (sid_mm, sod_mm, factor.filter(|factor| *factor > 1.0)) {
@@ -123,9 +125,15 @@ impl Reader<'_> {
                 ));
                 Ok([sod_mm * factor, sod_mm])
             }
-            _ => Ok([
-                self.needed(tags::DISTANCE_SOURCE_TO_DETECTOR, "DistanceSourceToDetector")?,
-                self.needed(tags::DISTANCE_SOURCE_TO_PATIENT, "DistanceSourceToPatient")?,
+            (sid_mm, sod_mm, _) => Ok([
+                match sid_mm {
+                    Some(mm) => mm,
+                    None => self.needed_or(tags::DISTANCE_SOURCE_TO_DETECTOR, "DistanceSourceToDetector", "--sid")?,
+                },
+                match sod_mm {
+                    Some(mm) => mm,
+                    None => self.needed_or(tags::DISTANCE_SOURCE_TO_PATIENT, "DistanceSourceToPatient", "--sod")?,
+                },
             ]),
         }
     }
@@ -137,7 +145,18 @@ impl Run {
     /// # Errors
     /// [`Error::Data`] naming file and tag; [`Error::Io`].
     pub fn read(path: &Path, pixel_mm: Option<[f64; 2]>) -> Result<Run> {
+        Run::read_as_stated(path, &StatedGeometry { pixel_mm, ..StatedGeometry::default() })
+    }
+
+    /// Reads a run whose geometry the user states, in whole or in part.
+    ///
+    /// # Errors
+    /// Errors of [`Run::read`].
+    pub fn read_as_stated(path: &Path, stated: &StatedGeometry) -> Result<Run> {
         let meta = std::fs::metadata(path).map_err(Error::io("read", path))?;
+        if meta.is_dir() {
+            return Err(Error::data(path, "file", "is a folder; give the files with runs in it"));
+        }
         if meta.len() > MAX_FILE_BYTES {
             let problem = format!("{} bytes are more than the accepted 4 GiB", meta.len());
             return Err(Error::data(path, "size", problem));
@@ -169,7 +188,7 @@ impl Run {
                 "all frames together have more pixels than the accepted maximum",
             ));
         }
-        let c_arms = r.c_arms(n, [width, height], pixel_mm, &mut notes)?;
+        let c_arms = r.c_arms(n, [width, height], stated, &mut notes)?;
         let times_s = timing::times(&r, n, &mut notes)?;
         let table = r.modality_table()?;
         let relationship = match table {
@@ -227,34 +246,44 @@ impl Reader<'_> {
         &self,
         n: usize,
         size: [usize; 2],
-        given: Option<[f64; 2]>,
+        stated: &StatedGeometry,
         notes: &mut Vec<String>,
     ) -> Result<Vec<CArm>> {
-        let primary = self.needed(tags::POSITIONER_PRIMARY_ANGLE, "PositionerPrimaryAngle")?;
-        let secondary = self.needed(tags::POSITIONER_SECONDARY_ANGLE, "PositionerSecondaryAngle")?;
-        let turn = tags::POSITIONER_PRIMARY_ANGLE_INCREMENT;
-        let primary = self.per_frame(primary, turn, "PositionerPrimaryAngleIncrement", n, notes)?;
-        let turn = tags::POSITIONER_SECONDARY_ANGLE_INCREMENT;
-        let secondary = self.per_frame(secondary, turn, "PositionerSecondaryAngleIncrement", n, notes)?;
-        let [sid_mm, sod_mm] = self.distances(notes)?;
+        // Stated angles are those of all frames: the file's increments belong to the file's angles.
+        let mut angles = |stated: Option<f64>, [tag, turn]: [Tag; 2], [name, turn_name]: [&str; 2]| match stated {
+            Some(angle) => Ok(vec![angle; n]),
+            None => self.per_frame(self.needed_or(tag, name, "--angles")?, turn, turn_name, n, notes),
+        };
+        let primary = angles(
+            stated.angles_deg.map(|angles| angles[0]),
+            [tags::POSITIONER_PRIMARY_ANGLE, tags::POSITIONER_PRIMARY_ANGLE_INCREMENT],
+            ["PositionerPrimaryAngle", "PositionerPrimaryAngleIncrement"],
+        )?;
+        let secondary = angles(
+            stated.angles_deg.map(|angles| angles[1]),
+            [tags::POSITIONER_SECONDARY_ANGLE, tags::POSITIONER_SECONDARY_ANGLE_INCREMENT],
+            ["PositionerSecondaryAngle", "PositionerSecondaryAngleIncrement"],
+        )?;
+        let [sid_mm, sod_mm] = self.distances(stated, notes)?;
         let spacing = self.numbers(tags::IMAGER_PIXEL_SPACING, "ImagerPixelSpacing")?;
-        let pixel_mm = match (given, spacing, self.numbers(tags::FIELD_OF_VIEW_DIMENSIONS, "FieldOfViewDimensions")?) {
-            (Some(pixel_mm), ..) => pixel_mm,
-            // DICOM lists the spacing of rows first.
-            (None, Some(spacing), _) if spacing.len() >= 2 => [spacing[1], spacing[0]],
-            (None, _, Some(field)) if field[0] > 0.0 => {
-                let pitch = field[0] / size[0].max(size[1]) as f64;
-                notes.push(format!(
+        let pixel_mm =
+            match (stated.pixel_mm, spacing, self.numbers(tags::FIELD_OF_VIEW_DIMENSIONS, "FieldOfViewDimensions")?) {
+                (Some(pixel_mm), ..) => pixel_mm,
+                // DICOM lists the spacing of rows first.
+                (None, Some(spacing), _) if spacing.len() >= 2 => [spacing[1], spacing[0]],
+                (None, _, Some(field)) if field[0] > 0.0 => {
+                    let pitch = field[0] / size[0].max(size[1]) as f64;
+                    notes.push(format!(
                     "ImagerPixelSpacing is missing: {pitch:.6} mm from FieldOfViewDimensions are used; --pixel-spacing \
                      overrides this value"
                 ));
-                [pitch; 2]
-            }
-            _ => {
-                let problem = "is missing; give the pixel spacing at the detector, in mm";
-                return Err(self.bad(tags::IMAGER_PIXEL_SPACING, "ImagerPixelSpacing", problem));
-            }
-        };
+                    [pitch; 2]
+                }
+                _ => {
+                    let problem = "is missing; give the pixel spacing at the detector, in mm, by --pixel-spacing";
+                    return Err(self.bad(tags::IMAGER_PIXEL_SPACING, "ImagerPixelSpacing", problem));
+                }
+            };
         // DICOM's table height is positive below the isocentre, so a larger height moves the patient towards posterior.
         let height = self.number(tags::TABLE_HEIGHT, "TableHeight")?.unwrap_or(0.0);
         let lateral = self.number(tags::TABLE_TRAVERSE, "TableTraverse")?.unwrap_or(0.0);
@@ -489,7 +518,7 @@ impl ModalityTable {
     }
 }
 
-/// Name of the tag from which a field of the geometry was read.
+/// Name of the tag (or the option) from which a field of the geometry was read.
 fn tag_of(field: &str) -> String {
     let name = match field {
         "sid_mm" => "(0018,1110) DistanceSourceToDetector",

@@ -4,6 +4,9 @@ use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT};
 use crate::import::angiograms::{Gating, ImportOptions, Prepared, TakenFrame};
 use crate::import::dicom::Run;
+use crate::import::pictures::{self, PictureView, PixelMeaning};
+use crate::import::stated::{StatedGeometry, StatedRun};
+use crate::scan::at_rest;
 use crate::scan::canvas::in_words;
 use crate::scan::dataset::{Layout, Split};
 use crate::scan::frame_checks::{check_values, checked_view};
@@ -56,7 +59,12 @@ impl Intake {
 
     /// Number of cardiac phases of the images.
     pub fn phases(&self) -> u32 {
-        if matches!(self.options.gating, Gating::Still) { 2 } else { self.options.phases }
+        if self.is_still() { at_rest::PHASES } else { self.options.phases }
+    }
+
+    /// Tells whether the runs show an object at rest.
+    pub fn is_still(&self) -> bool {
+        matches!(self.options.gating, Gating::Still)
     }
 
     /// Number of runs accepted so far.
@@ -79,7 +87,16 @@ impl Intake {
     ///
     /// # Errors
     /// [`Error::Data`] naming file and tag; [`Error::Config`] naming an option.
-    pub fn take(&mut self, mut runs: Vec<Run>) -> Result<Vec<String>> {
+    pub fn take(&mut self, runs: Vec<Run>) -> Result<Vec<String>> {
+        let gatings = vec![None; runs.len()];
+        self.take_gated(runs, &gatings)
+    }
+
+    /// Accepts all of the runs or none, as [`Intake::take`] does, with a source of the phases for each run that has its own.
+    ///
+    /// # Errors
+    /// Errors of [`Intake::take`].
+    pub fn take_gated(&mut self, mut runs: Vec<Run>, gatings: &[Option<Gating>]) -> Result<Vec<String>> {
         if self.runs() + runs.len() > MAX_RUNS {
             return Err(Error::config(
                 "FILE",
@@ -99,7 +116,11 @@ impl Intake {
             }
         }
         let options = &self.options;
-        let prepared = runs.par_iter().map(|run| Prepared::new(run, options)).collect::<Result<Vec<_>>>()?;
+        let prepare = |(index, run): (usize, &Run)| match gatings.get(index).cloned().flatten() {
+            Some(gating) => Prepared::new(run, &ImportOptions { gating, ..options.clone() }),
+            None => Prepared::new(run, options),
+        };
+        let prepared = runs.par_iter().enumerate().map(prepare).collect::<Result<Vec<_>>>()?;
         runs.iter().zip(&prepared).try_for_each(|(run, prepared)| trainable(run, prepared, options))?;
         notes.extend(prepared.iter().flat_map(|prepared| prepared.notes.iter().cloned()));
         self.taken = taken;
@@ -133,6 +154,7 @@ impl Intake {
             phases: self.phases(),
             depth_half_extent_mm: self.options.depth_half_extent_mm,
             vessel_attenuation_per_mm: None,
+            still: self.is_still(),
             size: [first.image.width, first.image.height],
             c_arm: first.c_arm.clone(),
         };
@@ -151,7 +173,8 @@ impl Intake {
             writer.frame(&geometry, Split::Train, view, *taken, image, None)?;
         }
         writer.finish()?;
-        Ok(format!("{} views of {} pixels at {} phases", views.len(), in_words(&sizes), self.phases()))
+        let times = if self.is_still() { "at rest".to_owned() } else { format!("at {} phases", self.phases()) };
+        Ok(format!("{} views of {} pixels {times}", views.len(), in_words(&sizes)))
     }
 }
 
@@ -197,12 +220,54 @@ fn check(run: &Run, before: &[AcceptedRun]) -> Vec<String> {
 /// [`Error::Data`] naming file and tag; [`Error::Config`] naming an option; [`Error::Io`]. In these cases no dataset is
 /// written.
 pub fn import_dicom(files: &[PathBuf], options: &ImportOptions, out: &Path) -> Result<Vec<String>> {
-    if files.is_empty() || files.len() > MAX_RUNS {
-        return Err(Error::config("FILE", files.len(), format!("is out of range: 1 to {MAX_RUNS} runs are accepted")));
+    import_dicom_as_stated(files, &vec![StatedRun::default(); files.len()], options, out)
+}
+
+/// Imports runs like [`import_dicom`], with what the user states of each; `stated` has one entry for each file.
+///
+/// # Errors
+/// Errors of [`import_dicom`].
+pub fn import_dicom_as_stated(
+    files: &[PathBuf],
+    stated: &[StatedRun],
+    options: &ImportOptions,
+    out: &Path,
+) -> Result<Vec<String>> {
+    check_number(files.len())?;
+    let read = |(file, stated): (&PathBuf, &StatedRun)| {
+        let pixel_mm = stated.geometry.pixel_mm.or(options.pixel_mm);
+        Run::read_as_stated(file, &StatedGeometry { pixel_mm, ..stated.geometry })
+    };
+    let runs = files.iter().zip(stated).map(read).collect::<Result<Vec<_>>>()?;
+    write_runs(runs, &stated.iter().map(|stated| stated.gating.clone()).collect::<Vec<_>>(), options, out)
+}
+
+/// Imports pictures as a dataset, one run per view, and returns notes for the user; `gatings` has one entry for each view.
+///
+/// # Errors
+/// Errors of [`import_dicom`].
+pub fn import_pictures(
+    views: &[PictureView],
+    gatings: &[Option<Gating>],
+    meaning: &PixelMeaning,
+    options: &ImportOptions,
+    out: &Path,
+) -> Result<Vec<String>> {
+    check_number(views.len())?;
+    let runs = views.iter().map(|view| pictures::read(view, meaning)).collect::<Result<Vec<_>>>()?;
+    write_runs(runs, gatings, options, out)
+}
+
+fn check_number(runs: usize) -> Result<()> {
+    if (1..=MAX_RUNS).contains(&runs) {
+        return Ok(());
     }
-    let runs = files.iter().map(|file| Run::read(file, options.pixel_mm)).collect::<Result<Vec<_>>>()?;
+    Err(Error::config("FILE", runs, format!("is out of range: 1 to {MAX_RUNS} runs are accepted")))
+}
+
+fn write_runs(runs: Vec<Run>, gatings: &[Option<Gating>], options: &ImportOptions, out: &Path) -> Result<Vec<String>> {
     let mut intake = Intake::new(options.clone());
-    let mut notes = intake.take(runs)?;
+    let mut notes = intake.take_gated(runs, gatings)?;
     notes.push(intake.write(out)?);
     Ok(notes)
 }

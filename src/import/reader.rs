@@ -42,6 +42,11 @@ impl<'a> Reader<'a> {
         self.number(tag, name)?.ok_or_else(|| self.bad(tag, name, "is missing"))
     }
 
+    /// Like [`Reader::needed`], for a value that an option can state.
+    pub(super) fn needed_or(&self, tag: Tag, name: &str, option: &str) -> Result<f64> {
+        self.number(tag, name)?.ok_or_else(|| self.bad(tag, name, format!("is missing; state it by {option}")))
+    }
+
     /// Returns the items of a sequence; none where it is missing.
     pub(super) fn items(&self, tag: Tag, name: &str) -> Result<Vec<Reader<'a>>> {
         match self.get(tag).map(|element| &element.value) {

@@ -38,6 +38,7 @@ fn options(gating: Gating, phases: u32) -> ImportOptions {
         frames: None,
         pixel_mm: None,
         size: None,
+        all_beats: false,
         depth_half_extent_mm: 90.0,
     }
 }

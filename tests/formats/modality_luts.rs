@@ -78,6 +78,7 @@ fn integrals(file: &Path, directory: &Path) -> Vec<f32> {
         frames: Some(1..=FRAMES),
         pixel_mm: None,
         size: None,
+        all_beats: false,
         depth_half_extent_mm: 90.0,
     };
     let out = directory.join("data");

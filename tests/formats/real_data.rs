@@ -28,6 +28,7 @@ fn options() -> ImportOptions {
         frames: None,
         pixel_mm: None,
         size: Some(256),
+        all_beats: false,
         depth_half_extent_mm: 100.0,
     }
 }

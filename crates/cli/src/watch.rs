@@ -16,6 +16,7 @@ use nertca_vk::import::angiograms::ImportOptions;
 use nertca_vk::import::dicom::Run;
 use nertca_vk::import::folder::Folder;
 use nertca_vk::import::intake::Intake;
+use nertca_vk::import::stated::{StatedGeometry, StatedRun};
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::scan::dataset::Split;
 use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions, State};
@@ -60,6 +61,8 @@ fn seconds(text: &str) -> std::result::Result<Duration, String> {
 /// Reads runs until a signal ends it, and writes a run directory.
 pub fn run(global: &GlobalOptions, args: &WatchArgs) -> Result<()> {
     let (config, options) = (args.config.load([])?, args.reading.options()?);
+    // Runs come in an order that nobody knows, so what is stated is stated of all.
+    let stated = args.reading.stated(1)?.remove(0);
     let mut folder = Folder::new(&args.directory);
     folder.look()?;
     prepare(&args.out)?;
@@ -67,7 +70,7 @@ pub fn run(global: &GlobalOptions, args: &WatchArgs) -> Result<()> {
     let gpu = global.open_device()?;
     let tuning = global.tuning(&gpu, &config);
     let intake = Intake::new(options.clone());
-    let live = Arc::new(Live::new(intake.phases(), config.train.iterations));
+    let live = Arc::new(Live::new(if intake.is_still() { 1 } else { intake.phases() }, config.train.iterations));
     let tree = Arc::new(TreeWork::new(&gpu, tuning.clone()));
     let server = Server::open(args.port, live.clone(), tree.clone())?;
     out!("{}", server.url());
@@ -84,6 +87,7 @@ pub fn run(global: &GlobalOptions, args: &WatchArgs) -> Result<()> {
         tuning,
         config,
         options,
+        stated,
         intake,
         live,
         tree,
@@ -111,6 +115,7 @@ struct Watch<'a> {
     tuning: Tuning,
     config: Config,
     options: ImportOptions,
+    stated: StatedRun,
     intake: Intake,
     live: Arc<Live>,
     tree: Arc<TreeWork>,
@@ -186,7 +191,8 @@ impl Watch<'_> {
 
     /// Reads a file; returns whether it could be used.
     fn take(&mut self, file: &Path) -> Result<bool> {
-        let read = Run::read(file, self.options.pixel_mm).and_then(|run| match self.intake.copy_of(&run) {
+        let geometry = StatedGeometry { pixel_mm: self.options.pixel_mm, ..self.stated.geometry };
+        let read = Run::read_as_stated(file, &geometry).and_then(|run| match self.intake.copy_of(&run) {
             Some(first) => {
                 Err(Error::data(file, "SOPInstanceUID", format!("is the same as that of {first}, which was imported")))
             }
@@ -194,7 +200,7 @@ impl Watch<'_> {
         });
         let taken = read.and_then(|run| {
             let told = describe(&run);
-            Ok((told, self.intake.take(vec![run])?))
+            Ok((told, self.intake.take_gated(vec![run], std::slice::from_ref(&self.stated.gating))?))
         });
         match taken {
             Ok((told, notes)) => {
@@ -240,6 +246,7 @@ impl Watch<'_> {
                     phases: self.intake.phases(),
                     depth_half_extent_mm: self.options.depth_half_extent_mm,
                     vessel_attenuation_per_mm: None,
+                    still: self.intake.is_still(),
                     deterministic: false,
                 };
                 let session = Session::new(Some(self.gpu.clone()), Some(self.tuning.clone()), options)?;

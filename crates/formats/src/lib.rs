@@ -5,13 +5,15 @@
 //! | [`volume`], [`volume_files`] | a scalar volume, read from any of the formats below |
 //! | [`nrrd`], [`nifti`], [`metaimage`], [`npy`], [`raw`], [`vtk`] | volumes and arrays |
 //! | [`mesh`], [`gltf`], [`vtp`], [`swc`] | surfaces and centrelines |
-//! | [`raster`], [`images`], [`png`], [`image_limits`] | pictures |
+//! | [`raster`], [`images`], [`png`], [`image_limits`], [`frames`] | pictures |
 //! | [`files`] | atomic writing, locks, limited reading |
 //!
 //! Lengths are mm, and positions are patient coordinates (LPS) unless a format has others.
 
 pub mod error;
 pub mod files;
+#[cfg(feature = "frames")]
+pub mod frames;
 pub mod gltf;
 pub mod image_limits;
 pub mod images;

@@ -1,0 +1,106 @@
+//! `import pictures`: views as folders of pictures, whose geometry is given by options.
+
+use super::dicom_args::{RunArgs, for_each};
+use super::output::write_dataset;
+use super::synthetic_args::{AngleList, pitch, view_angles};
+use clap::{Args, ValueEnum};
+use nertca_vk::error::Result;
+use nertca_vk::geometry::CArm;
+use nertca_vk::import::dicom::Relationship;
+use nertca_vk::import::intake::import_pictures;
+use nertca_vk::import::pictures::{PictureView, PixelMeaning};
+use std::path::PathBuf;
+
+/// Arguments of `import pictures`.
+#[derive(Debug, Args)]
+pub struct ImportPicturesArgs {
+    /// Views: a folder with one picture per frame (.png, .jpg or .tif, in the order of the numbers in their names), or a file
+    /// with one or more frames.
+    #[arg(required = true, value_name = "DIR_OR_FILE")]
+    pub views: Vec<PathBuf>,
+    /// Directory to write.
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// Replace a dataset that the directory already contains.
+    #[arg(short, long)]
+    pub force: bool,
+    /// Primary and secondary angle of each view, degrees (LAO and cranial positive).
+    #[arg(long, value_name = "P,S;P,S...", allow_hyphen_values = true, value_parser = view_angles)]
+    pub angles: AngleList,
+    /// Distance from source to detector, mm: one for all views, or one for each.
+    #[arg(long, required = true, value_name = "MM[,MM...]", value_delimiter = ',')]
+    pub sid: Vec<f64>,
+    /// Distance from source to isocentre, mm: one for all views, or one for each.
+    #[arg(long, required = true, value_name = "MM[,MM...]", value_delimiter = ',')]
+    pub sod: Vec<f64>,
+    /// Pitch of the pictures' pixels on the detector along columns and rows, mm: one number or two.
+    #[arg(long, value_name = "MM[,MM]", value_parser = pitch)]
+    pub pixel: [f64; 2],
+    /// Frames per second: one for all views, or one for each. Needed unless the object is still or --phase-list is given.
+    #[arg(long, value_name = "PER_S[,PER_S...]", value_delimiter = ',')]
+    pub fps: Vec<f64>,
+    /// Meaning of pixel values: `display` (as viewers export them: taken as logarithmic, with an unknown scale), `log`
+    /// (logarithmic in intensity) or `linear` (proportional to intensity).
+    #[arg(long, value_enum, default_value_t = Meaning::Display)]
+    pub intensity: Meaning,
+    /// Pixel value without absorption; by default the largest one that the files can store.
+    #[arg(long, value_name = "VALUE")]
+    pub white: Option<f64>,
+    /// Vessels are brighter than their surroundings.
+    #[arg(long)]
+    pub bright_vessels: bool,
+    /// Letters are burnt into the frames: pixels that are black or white in all frames are filled from beside them.
+    #[arg(long)]
+    pub burnt_in_text: bool,
+    /// Options of runs of any source.
+    #[command(flatten)]
+    pub runs: RunArgs,
+}
+
+/// Meaning of pixel values.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Meaning {
+    /// Display grey values.
+    Display,
+    /// Logarithmic in intensity.
+    Log,
+    /// Proportional to intensity.
+    Linear,
+}
+
+/// Imports pictures.
+pub fn run(args: &ImportPicturesArgs) -> Result<()> {
+    let n = args.views.len();
+    let (options, gatings) = (args.runs.options()?, args.runs.gatings(n)?);
+    let angles = for_each("--angles", &args.angles.0, n)?;
+    let (sid, sod) = (for_each("--sid", &args.sid, n)?, for_each("--sod", &args.sod, n)?);
+    let fps = for_each("--fps", &args.fps, n)?;
+    let view = |i: usize| PictureView {
+        path: args.views[i].clone(),
+        c_arm: CArm {
+            primary_deg: angles[i].map_or(0.0, |angles| angles.primary_deg),
+            secondary_deg: angles[i].map_or(0.0, |angles| angles.secondary_deg),
+            sid_mm: sid[i].unwrap_or_default(),
+            sod_mm: sod[i].unwrap_or_default(),
+            pixel_mm: args.pixel,
+            offset_mm: [0.0; 2],
+            table_mm: [0.0; 3],
+        },
+        frames_per_s: fps[i],
+    };
+    let views: Vec<PictureView> = (0..n).map(view).collect();
+    let meaning = PixelMeaning {
+        relationship: match args.intensity {
+            Meaning::Display => Relationship::Display,
+            Meaning::Log => Relationship::Log,
+            Meaning::Linear => Relationship::Linear,
+        },
+        white: args.white,
+        bright_vessels: args.bright_vessels,
+        burnt_in_text: args.burnt_in_text,
+    };
+    let notes = write_dataset(&args.out, args.force, |out| import_pictures(&views, &gatings, &meaning, &options, out))?;
+    notes.iter().for_each(|note| eprintln!("{note}"));
+    out!("{}", args.out.display());
+    Ok(())
+}
