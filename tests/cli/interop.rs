@@ -364,7 +364,7 @@ fn dicom_nobody_should_send_is_refused_by_name() {
     refuse("not there.dcm", "not there.dcm", &[]);
     refuse("good.dcm", "frames", &["--frames", "3-9"]);
     refuse("good.dcm", "size", &["--size", "2"]);
-    fails(&["import", "dicom", text(dir.path()), "-o", text(&out), "--still"], 1, &["size"]);
+    fails(&["import", "dicom", text(dir.path()), "-o", text(&out), "--still"], 1, &["is a folder"]);
 }
 
 /// Centre of a square of a colour, in which nearly all pixels have the colour.

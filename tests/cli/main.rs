@@ -44,3 +44,5 @@ mod tree_pages;
 mod trees;
 mod volume_scores;
 mod watch;
+mod ways_in;
+mod ways_out;

@@ -2,13 +2,14 @@
 
 use super::calibration_table;
 use super::options::choice;
+use super::output::{CALIBRATION, write_dataset};
 use clap::Args;
 use nertca_vk::calibrate::calibrate;
 use nertca_vk::config::{CalibrateMode, Config, Preset};
-use nertca_vk::error::{Error, Result};
+use nertca_vk::error::Result;
 use nertca_vk::files;
 use nertca_vk::run::silhouette_pictures;
-use nertca_vk::scan::dataset::{Dataset, Layout, MANIFEST};
+use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::scan::writer;
 use std::path::PathBuf;
 
@@ -24,30 +25,31 @@ pub struct CalibrateArgs {
     /// `calibration`.
     #[arg(short, long)]
     pub out: PathBuf,
+    /// Replace a dataset that the directory already contains.
+    #[arg(short, long)]
+    pub force: bool,
     /// Print JSON instead of a table.
     #[arg(long)]
     pub json: bool,
 }
 
-/// Folder in the dataset for the description and pictures of the correction.
-const FOLDER: &str = "calibration";
-
 /// Corrects a dataset.
 pub fn run(args: &CalibrateArgs) -> Result<()> {
     let dataset = Dataset::open(&args.data)?;
-    if args.out.join(MANIFEST).exists() {
-        return Err(Error::config("--out", args.out.display(), "already contains a dataset; choose another directory"));
-    }
     let mut config = Config::preset(Preset::Fast);
     config.calibrate.mode = args.mode;
-    let calibration = calibrate(&dataset, &config)?;
-    let corrected = dataset.corrected(&calibration)?;
-    let description = format!("calibrated from {}", dataset.path.display());
-    writer::write(&corrected, Layout::Native, &args.out, description, &|view| calibration.stated(view).cloned())?;
-    let folder = args.out.join(FOLDER);
-    files::create_directory(&folder)?;
-    calibration.write(&folder)?;
-    silhouette_pictures::write(&folder, &dataset, &corrected)?;
+    let calibration = write_dataset(&args.out, args.force, |out| {
+        let calibration = calibrate(&dataset, &config)?;
+        let corrected = dataset.corrected(&calibration)?;
+        let description = format!("calibrated from {}", dataset.path.display());
+        writer::write(&corrected, Layout::Native, out, description, &|view| calibration.stated(view).cloned())?;
+        let folder = out.join(CALIBRATION);
+        files::create_directory(&folder)?;
+        calibration.write(&folder)?;
+        silhouette_pictures::write(&folder, &dataset, &corrected)?;
+        Ok(calibration)
+    })?;
+    let folder = args.out.join(CALIBRATION);
     if args.json {
         out!("{}", files::pretty_json(&calibration)?);
     } else {

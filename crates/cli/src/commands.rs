@@ -10,6 +10,7 @@ use super::export::{self, ConvertArgs, ExportArgs};
 use super::info::{self, InfoArgs};
 use super::kernels::{self, KernelsArgs};
 use super::options::GlobalOptions;
+use super::progress::clean_up_on_signals;
 use super::render::{self, RenderArgs};
 use super::selftest::{self, SelftestArgs};
 use super::study::{self, StudyArgs};
@@ -27,7 +28,7 @@ First steps:
   nertca-vk phantom heart          make a synthetic dataset in the directory `heart`
   nertca-vk train heart            reconstruct it; the run is in `heart-run`, its page in `heart-run/report.html`
   nertca-vk view heart-run         turn the C-arm in a browser while the beat plays
-Angiograms of your own: nertca-vk import dicom --help; without DICOM, docs/formats.md describes `dataset.json`.";
+Angiograms of your own: nertca-vk import dicom --help, or import pictures --help; docs/formats.md describes `dataset.json`.";
 
 /// 4D reconstruction of the beating coronary arteries from 3 or 4 X-ray angiography views.
 #[derive(Debug, Parser)]
@@ -50,7 +51,7 @@ pub enum Command {
     Phantom(PhantomArgs),
     /// Make a dataset from projections of voxel volumes, one volume per phase.
     Project(ProjectArgs),
-    /// Import clinical data as a dataset.
+    /// Import clinical data, DICOM files or pictures, as a dataset.
     Import(ImportArgs),
     /// Reconstruct a dataset into a run directory.
     Train(TrainArgs),
@@ -86,10 +87,30 @@ pub enum Command {
     Completions(CompletionsArgs),
 }
 
+impl Command {
+    /// Tells whether a command does nothing but write new files, so that nothing is lost where a signal ends it at once.
+    fn only_writes(&self) -> bool {
+        matches!(
+            self,
+            Command::Phantom(_)
+                | Command::Project(_)
+                | Command::Import(_)
+                | Command::Render(_)
+                | Command::Export(_)
+                | Command::Tree(_)
+                | Command::Calibrate(_)
+                | Command::Convert(_)
+        )
+    }
+}
+
 impl Cli {
     /// Executes the command.
     pub fn run(&self) -> Result<()> {
         let global = &self.global;
+        if self.command.only_writes() {
+            clean_up_on_signals()?;
+        }
         match &self.command {
             Command::Devices(args) => devices::run(args),
             Command::Phantom(args) => data::phantom(global, args),

@@ -2,16 +2,18 @@
 
 use super::dicom_args::DicomArgs;
 use super::options::GlobalOptions;
+use super::output::write_dataset;
+use super::picture_args::{self, ImportPicturesArgs};
 use super::synthetic_args::{PhantomArgs, ProjectArgs};
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::formats::volume::VolumeHints;
-use nertca_vk::import::intake::import_dicom;
+use nertca_vk::import::intake::import_dicom_as_stated;
 use nertca_vk::phantom::dataset::{Anatomy, PhantomOptions, VolumeOptions, make, project_volumes};
 use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::scan::dataset::Layout;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Arguments of `import`.
 #[derive(Debug, Args)]
@@ -26,6 +28,8 @@ pub struct ImportArgs {
 pub enum ImportSource {
     /// X-ray angiography runs (DICOM XA or RF, multi-frame), one file per view.
     Dicom(ImportDicomArgs),
+    /// X-ray angiography runs as pictures (PNG, JPEG, TIFF), one folder of frames per view, with a geometry by options.
+    Pictures(ImportPicturesArgs),
 }
 
 /// Arguments of `import dicom`.
@@ -37,6 +41,9 @@ pub struct ImportDicomArgs {
     /// Directory to write.
     #[arg(short, long)]
     pub out: PathBuf,
+    /// Replace a dataset that the directory already contains.
+    #[arg(short, long)]
+    pub force: bool,
     /// Options of reading runs.
     #[command(flatten)]
     pub reading: DicomArgs,
@@ -92,7 +99,7 @@ pub fn phantom(global: &GlobalOptions, args: &PhantomArgs) -> Result<()> {
         volumes_every: (!args.no_volumes).then_some(args.volumes_every),
     };
     tell_of_times(options.layout, &options.degradations);
-    warn(&make(&gpu, &options, &args.out, bar())?);
+    warn(&write_dataset(&args.out, args.force, |out| make(&gpu, &options, out, bar()))?);
     out!("{}", args.out.display());
     global.close_device(&gpu)
 }
@@ -111,6 +118,7 @@ pub fn project(global: &GlobalOptions, args: &ProjectArgs) -> Result<()> {
         hounsfield: args.hounsfield,
         scale: args.scale,
         vessel_per_mm: args.vessel,
+        still: args.still,
         c_arms: args.c_arm.options(),
         size: args.size,
         views: args.views.views()?,
@@ -119,7 +127,7 @@ pub fn project(global: &GlobalOptions, args: &ProjectArgs) -> Result<()> {
         layout: args.layout,
     };
     tell_of_times(options.layout, &options.degradations);
-    warn(&project_volumes(&gpu, &options, &args.out, bar())?);
+    warn(&write_dataset(&args.out, args.force, |out| project_volumes(&gpu, &options, out, bar()))?);
     out!("{}", args.out.display());
     global.close_device(&gpu)
 }
@@ -128,11 +136,16 @@ pub fn project(global: &GlobalOptions, args: &ProjectArgs) -> Result<()> {
 pub fn import(args: &ImportArgs) -> Result<()> {
     match &args.source {
         ImportSource::Dicom(args) => dicom(args),
+        ImportSource::Pictures(args) => picture_args::run(args),
     }
 }
 
 fn dicom(args: &ImportDicomArgs) -> Result<()> {
-    import_dicom(&args.files, &args.reading.options()?, &args.out)?.iter().for_each(|note| eprintln!("{note}"));
+    let options = args.reading.options()?;
+    let stated = args.reading.stated(args.files.len())?;
+    let import = |out: &Path| import_dicom_as_stated(&args.files, &stated, &options, out);
+    let notes = write_dataset(&args.out, args.force, import)?;
+    notes.iter().for_each(|note| eprintln!("{note}"));
     out!("{}", args.out.display());
     Ok(())
 }

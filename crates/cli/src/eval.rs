@@ -1,6 +1,7 @@
 //! The command `eval`.
 
 use super::options::GlobalOptions;
+use super::output::Earlier;
 use super::progress::{show_evaluation, stop_flag};
 use super::report::Report;
 use super::tree::{of_page as tree_of_page, score as score_tree_of_page};
@@ -33,6 +34,9 @@ pub struct EvalArgs {
     /// `eval.html`.
     #[arg(long, value_name = "DIR")]
     pub images: Option<PathBuf>,
+    /// Replace the page and the pictures of an earlier evaluation in the directory of --images.
+    #[arg(short, long, requires = "images")]
+    pub force: bool,
     /// Also find the vessels as a tree (takes seconds): shown over the angiograms on the page, with lengths and diameters, and
     /// written as `tree.json` beside it.
     #[arg(long)]
@@ -54,11 +58,16 @@ pub fn eval(global: &GlobalOptions, args: &EvalArgs) -> Result<()> {
     if args.threshold.is_some_and(|t| !(t.is_finite() && t >= 0.0)) {
         return Err(Error::config("--threshold", args.threshold.unwrap_or_default(), "is negative"));
     }
+    let earlier = match &args.images {
+        Some(directory) => Earlier::pictures(directory, args.force)?,
+        None => Earlier::none(),
+    };
     let dataset = as_trained(Dataset::open(&data)?, &args.run)?;
     let gpu = global.open_device()?;
     let model = newest_model(&args.run)?;
     let tuning = global.tuning(&gpu, &model.config);
     let cancel = stop_flag()?;
+    earlier.make_way(&[])?;
     let scoring = ScoreOptions { threshold_per_mm: args.threshold, pictures: args.images.as_deref(), cancel: &cancel };
     let mut evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, &scoring, &mut show_evaluation())?;
     if args.ceiling {

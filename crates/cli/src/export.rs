@@ -2,6 +2,7 @@
 
 use super::data::bar;
 use super::options::{GlobalOptions, choice};
+use super::output::{Earlier, write_dataset};
 use clap::Args;
 use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
@@ -14,6 +15,7 @@ use nertca_vk::model::Model;
 use nertca_vk::model::component::Component;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout};
+use nertca_vk::scan::writer::convert as convert_dataset;
 use nertca_vk::vessels::threshold::vessel_threshold_per_mm;
 use std::path::PathBuf;
 
@@ -53,6 +55,9 @@ pub struct ExportArgs {
     /// With --motion: write the path of each Gaussian over the beat, including its own motion, as lines in a .vtk.
     #[arg(long, requires = "motion", conflicts_with_all = ["compress", "phase"])]
     pub trajectories: bool,
+    /// Replace the files of an earlier series (`NAME_0000.EXT` and so on), all of them.
+    #[arg(short, long)]
+    pub force: bool,
     /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .nii.gz, .mha, .npy or .vtk.
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
@@ -69,12 +74,16 @@ pub struct ConvertArgs {
     /// Directory to write.
     #[arg(short, long)]
     pub out: PathBuf,
+    /// Replace a dataset that the directory already contains.
+    #[arg(short, long)]
+    pub force: bool,
 }
 
-/// Returns the phases that `--phase` names, and whether it names all.
-pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {
+/// Returns the phases of a model that `--phase` names, and whether they are a sequence: all phases of an object that moves.
+pub fn phases(text: &str, model: &Model) -> Result<(Vec<u32>, bool)> {
+    let n_phases = model.shown_phases();
     match text {
-        "all" => Ok(((0..n_phases).collect(), true)),
+        "all" => Ok(((0..n_phases).collect(), !model.scene.still)),
         text => match text.parse() {
             Ok(phase) if phase < n_phases => Ok((vec![phase], false)),
             _ => {
@@ -87,7 +96,7 @@ pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {
 /// Exports volumes or surfaces.
 pub fn export(global: &GlobalOptions, args: &ExportArgs) -> Result<()> {
     let model = newest_model(&args.run)?;
-    let (phases, all) = phases(&args.phase, model.param_map.phases as u32)?;
+    let (phases, all) = phases(&args.phase, &model)?;
     if args.motion {
         return export_motion(args, &model, phases, all);
     }
@@ -105,11 +114,15 @@ pub fn export(global: &GlobalOptions, args: &ExportArgs) -> Result<()> {
     let mut progress = bar();
     let made = if args.mesh {
         let format = MeshFormat::of(&args.out).ok_or_else(|| unknown(".stl .ply .obj .glb"))?;
+        let earlier = earlier(args, phases.len() > 1 && format != MeshFormat::Glb)?;
         let iso = match args.iso {
             Some(iso) => iso,
             None => vessel_threshold_per_mm(&renderer, &model, &grid)?,
         };
-        write_meshes(&renderer, &grid, &phases, iso, format, &args.out, |n, of| progress("surfaces", n, of))?
+        let made =
+            write_meshes(&renderer, &grid, &phases, iso, format, &args.out, |n, of| progress("surfaces", n, of))?;
+        earlier.make_way(&made)?;
+        made
     } else {
         let of_name = Format::of(&args.out);
         let format = args.format.or(of_name.map(|(format, _)| format));
@@ -123,7 +136,10 @@ pub fn export(global: &GlobalOptions, args: &ExportArgs) -> Result<()> {
             format: format.ok_or_else(|| unknown(".nrrd .nii .nii.gz .mha .npy .vtk; choose one with --format"))?,
             compression: if compressed { Compression::Gzip } else { Compression::None },
         };
-        export.write(&renderer, &args.out, |n, of| progress("volume", n, of))?
+        let earlier = earlier(args, export.format == Format::Vtk && export.sequence)?;
+        let made = export.write(&renderer, &args.out, |n, of| progress("volume", n, of))?;
+        earlier.make_way(&made)?;
+        made
     };
     made.iter().for_each(|path| out!("{}", path.display()));
     let [nx, ny, nz] = grid.size;
@@ -134,6 +150,11 @@ pub fn export(global: &GlobalOptions, args: &ExportArgs) -> Result<()> {
     );
     drop(renderer);
     global.close_device(&gpu)
+}
+
+/// Files of an earlier series in the way of an export that writes one file per phase.
+fn earlier(args: &ExportArgs, several: bool) -> Result<Earlier> {
+    if several { Earlier::series(&args.out, args.force) } else { Ok(Earlier::none()) }
 }
 
 /// Exports displacements, or the paths of the Gaussians; needs no device.
@@ -150,7 +171,10 @@ fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: b
     } else {
         let encoding = if args.compress { Encoding::Gzip } else { Encoding::Raw };
         let format = format.ok_or_else(|| unknown(".nrrd .vtk"))?;
-        MotionExport { deformable: tree, phases, sequence, format, encoding }.write(&args.out)?
+        let earlier = earlier(args, format == MotionFormat::Vtk && sequence)?;
+        let made = MotionExport { deformable: tree, phases, sequence, format, encoding }.write(&args.out)?;
+        earlier.make_way(&made)?;
+        made
     };
     made.iter().for_each(|path| out!("{}", path.display()));
     eprintln!(
@@ -169,7 +193,10 @@ pub fn convert(args: &ConvertArgs) -> Result<()> {
             "{between} frames lie between two phases; this layout has whole phases only, so they get the nearest phase"
         );
     }
-    nertca_vk::scan::writer::convert(&dataset, args.layout, &args.out)?;
+    if args.layout == Layout::Nerfca && dataset.still {
+        eprintln!("this layout cannot state that the object is at rest: phase 1 is the object without its vessels");
+    }
+    write_dataset(&args.out, args.force, |out| convert_dataset(&dataset, args.layout, out))?;
     out!("{}", args.out.display());
     Ok(())
 }

@@ -7,6 +7,13 @@ macro_rules! out {
     };
 }
 
+/// Prints a message to stderr as the standard macro does, with control characters escaped; see [`stdout::printable`].
+macro_rules! eprintln {
+    ($($text:tt)*) => {
+        crate::stdout::print_message(format_args!($($text)*))
+    };
+}
+
 mod bench;
 mod bench_report;
 mod calibrate;
@@ -27,7 +34,9 @@ mod kernels;
 mod lettering;
 mod memory;
 mod options;
+mod output;
 mod page;
+mod picture_args;
 mod plot;
 mod progress;
 mod render;
@@ -66,6 +75,7 @@ fn main() -> ExitCode {
         }))
         .without_time()
         .init();
+    ignore_file_size_signal();
     match cli.run().and_then(|()| stdout::finish()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
@@ -77,3 +87,16 @@ fn main() -> ExitCode {
         }
     }
 }
+
+/// Makes a write beyond the limit of file sizes (`ulimit -f`) an ordinary error, where the system would end the program by a
+/// signal and leave partial files.
+#[cfg(unix)]
+fn ignore_file_size_signal() {
+    // SAFETY: an ignored signal runs no handler, and nothing else in this process concerns itself with this signal.
+    unsafe {
+        libc::signal(libc::SIGXFSZ, libc::SIG_IGN);
+    }
+}
+
+#[cfg(not(unix))]
+fn ignore_file_size_signal() {}

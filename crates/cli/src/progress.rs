@@ -1,7 +1,9 @@
 //! Progress of a run, as text for people and as JSON for programs, and the signals that stop it.
 
+use super::stdout::printable;
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::error::{Error, Result};
+use nertca_vk::files;
 use nertca_vk::fitting::losses::LargeLoss;
 use nertca_vk::run::events::Event;
 use std::io::IsTerminal;
@@ -17,12 +19,23 @@ pub fn stop_flag() -> Result<Arc<AtomicBool>> {
     let seen = stop.clone();
     ctrlc::set_handler(move || {
         if seen.swap(true, Ordering::Relaxed) {
+            files::remove_unfinished();
             std::process::exit(i32::from(super::exit::INTERRUPTED));
         }
         eprintln!("nertca-vk: the program will stop after the current work; press Ctrl-C again to stop immediately");
     })
     .map_err(|e| Error::Internal(format!("the Ctrl-C handler could not be set: {e}")))?;
     Ok(stop)
+}
+
+/// Makes Ctrl-C and SIGTERM end the program at once, after what it is writing has been removed. For commands without work that
+/// could be continued.
+pub fn clean_up_on_signals() -> Result<()> {
+    ctrlc::set_handler(|| {
+        files::remove_unfinished();
+        std::process::exit(i32::from(super::exit::INTERRUPTED));
+    })
+    .map_err(|e| Error::Internal(format!("the Ctrl-C handler could not be set: {e}")))
 }
 
 /// Prints an event as one line of JSON on stdout.
@@ -45,7 +58,7 @@ pub fn show_progress() -> impl FnMut(&Event) {
     let terminal = std::io::stderr().is_terminal();
     let bar = bar("[{bar:30}] {pos}/{len} {msg}");
     let say = move |bar: &ProgressBar, text: String| {
-        if terminal { bar.println(text) } else { eprintln!("{text}") }
+        if terminal { bar.println(printable(&text)) } else { eprintln!("{text}") }
     };
     let mut evaluation = show_evaluation();
     move |event| match event {

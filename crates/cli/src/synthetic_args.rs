@@ -19,6 +19,9 @@ use std::path::PathBuf;
 pub struct PhantomArgs {
     /// Directory to write.
     pub out: PathBuf,
+    /// Replace a dataset that the directory already contains.
+    #[arg(short, long)]
+    pub force: bool,
     /// C-arm and volume of a published set-up: `xcat` (DSD 2500, DSO 450) or `magix` (DSD 2000, DSO 600).
     #[arg(long, value_parser = choice::<Setting>(), default_value = Setting::Xcat.name())]
     pub geometry: Setting,
@@ -77,6 +80,9 @@ pub struct ProjectArgs {
     /// Directory to write.
     #[arg(short, long)]
     pub out: PathBuf,
+    /// Replace a dataset that the directory already contains.
+    #[arg(short, long)]
+    pub force: bool,
     /// Columns and rows of the images.
     #[arg(long, default_value_t = 200)]
     pub size: usize,
@@ -95,6 +101,9 @@ pub struct ProjectArgs {
     /// Voxels at or above this attenuation per mm are vessel, for the masks and the Dice threshold.
     #[arg(long, value_name = "PER_MM")]
     pub vessel: Option<f64>,
+    /// The object does not move: one volume, and a dataset that says so (`"still": true`).
+    #[arg(long)]
+    pub still: bool,
     /// Voxel spacing of .npy and raw volumes, mm.
     #[arg(long, value_name = "X,Y,Z", value_parser = triple::<f64>)]
     pub spacing: Option<[f64; 3]>,
@@ -284,7 +293,7 @@ fn offset(text: &str) -> std::result::Result<[f64; 2], String> {
 }
 
 /// Parses `P,S[;P,S...]`.
-fn view_angles(text: &str) -> std::result::Result<AngleList, String> {
+pub(super) fn view_angles(text: &str) -> std::result::Result<AngleList, String> {
     let view = |view: &str| match pair(view) {
         Some([primary_deg, secondary_deg]) => Ok(Angles { primary_deg, secondary_deg }),
         None => Err(format!(

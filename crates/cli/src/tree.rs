@@ -3,6 +3,7 @@
 use super::data::bar;
 use super::export::phases;
 use super::options::GlobalOptions;
+use super::output::Earlier;
 use clap::Args;
 use nertca_vk::checkpoint::newest_model;
 use nertca_vk::error::{Error, Result};
@@ -36,6 +37,9 @@ pub struct TreeArgs {
     /// omitted. By default three times the field's resolution.
     #[arg(long, value_name = "MM")]
     pub min_branch: Option<f64>,
+    /// Replace the files of an earlier series (`NAME_0000.EXT` and so on), all of them.
+    #[arg(short, long)]
+    pub force: bool,
     /// Output: .json (all phases), .vtp (one file per phase, and a .pvd that lists them, for ParaView, 3D Slicer and
     /// VMTK), .swc (one file per phase), in millimetres along (left, posterior, superior); or .glb (tubes, animated
     /// over the beat; metres).
@@ -56,7 +60,7 @@ pub fn of_page(
     directory: &Path,
     warnings: &mut Vec<String>,
 ) -> Result<Option<BeatTree>> {
-    let phases = (0..model.param_map.phases as u32).collect();
+    let phases = (0..model.shown_phases()).collect();
     let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };
     match find(global, gpu, model, cancel, &options) {
         Ok(beat) => {
@@ -129,12 +133,15 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     let unknown = || Error::config("--out", args.out.display(), "does not end in one of .json .vtp .swc .glb");
     let format = TreeFormat::of(&args.out).ok_or_else(unknown)?;
     let model = newest_model(&args.run)?;
-    let (phases, all) = phases(&args.phase, model.param_map.phases as u32)?;
+    let (phases, all) = phases(&args.phase, &model)?;
+    let several = all && matches!(format, TreeFormat::Vtp | TreeFormat::Swc);
+    let earlier = if several { Earlier::series(&args.out, args.force)? } else { Earlier::none() };
     let gpu = global.open_device()?;
     let options = TreeOptions { phases, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
     // Ctrl-C may end the program at once, because no partial result has been written here.
     let beat = find(global, &gpu, &model, &AtomicBool::new(false), &options)?;
     let made = write(&beat, &args.out, format, all)?;
+    earlier.make_way(&made)?;
     made.iter().for_each(|path| out!("{}", path.display()));
     for tree in &beat.phases {
         eprintln!(
