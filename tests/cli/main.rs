@@ -42,6 +42,7 @@ mod study;
 mod tree_files;
 mod tree_pages;
 mod trees;
+mod viewer_ends;
 mod volume_scores;
 mod watch;
 mod ways_in;

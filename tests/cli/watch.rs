@@ -258,6 +258,22 @@ fn a_folder_without_runs_leaves_nothing() {
     assert!(!run.exists());
 }
 
+#[test]
+fn a_run_directory_that_another_process_trains_into_is_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let (inbox, run) = (directory.path().join("inbox"), directory.path().join("run"));
+    std::fs::create_dir(&inbox).unwrap();
+    let mut first = Watcher::new(&[text(&inbox), "-o", text(&run)]);
+    first.hear("watching ");
+    let second = program().args(["watch", text(&inbox), "-o", text(&run)]).output().unwrap();
+    let told = String::from_utf8_lossy(&second.stderr);
+    assert_eq!(second.status.code(), Some(75), "{told}");
+    assert!(told.contains("another process trains into this run directory"), "{told}");
+    first.interrupt();
+    assert!(!first.end().1);
+    assert!(!run.exists(), "nothing was reconstructed");
+}
+
 /// Starts with two runs, adds a third once training satisfies `far`, and sends Ctrl-C. The result continues with `train
 /// --resume`. Returns the messages, and the number of remaining runs.
 fn interrupted_after_a_third_run(iterations: u32, far: impl Fn(&Value) -> bool) -> (String, usize) {

@@ -172,10 +172,10 @@ fn write_scores(report: &Path, scores: &Evaluation) -> Result<()> {
 }
 
 /// Name of the file that the process holds which trains into a run directory.
-const LOCK: &str = "train.lock";
+pub(super) const LOCK: &str = "train.lock";
 
-/// Takes a run directory for this process, so that two trainings do not mix their files in it.
-fn take_run(run: &Path) -> Result<Lock> {
+/// Takes a run directory for this process, so that two trainings, or a training and a watch, do not mix their files in it.
+pub(super) fn take_run(run: &Path) -> Result<Lock> {
     Lock::take(&run.join(LOCK))?.ok_or_else(|| {
         let problem = "another process trains into this run directory: wait for it, or choose another --out";
         Error::Busy(format!("{}: {problem}", run.display()))

@@ -8,6 +8,7 @@ use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::Result;
 use nertca_vk::geometry::ViewRays;
+use nertca_vk::gpu::device::Gpu;
 use nertca_vk::model::Model;
 use nertca_vk::model::component::Component;
 use nertca_vk::render::baked::Baked;
@@ -37,6 +38,7 @@ struct Finished {
     taken: AngiogramGeometry,
     /// Baked volumes. The lock allows one picture at a time, because pictures share the device.
     baked: Mutex<Baked>,
+    gpu: Gpu,
     /// Largest value of each kind of picture.
     ranges: HashMap<Quantity, f32>,
 }
@@ -55,6 +57,7 @@ impl PictureSource for Finished {
     }
 
     fn render(&self, rays: &ViewRays, side: usize, phase: u32, quantity: Quantity) -> Result<Vec<f32>> {
+        let _drawn = self.gpu.looks().begin();
         self.baked.lock().unwrap_or_else(PoisonError::into_inner).render(rays, side, side, phase, quantity)
     }
 
@@ -77,6 +80,7 @@ pub fn view(global: &GlobalOptions, args: &ViewArgs) -> Result<()> {
     let mut shown = Finished {
         taken: AngiogramGeometry { c_arm: model.c_arm.clone(), image_size: model.image_size },
         baked: Mutex::new(Baked::for_display(renderer, &model, CELL_MM)),
+        gpu: gpu.clone(),
         ranges: HashMap::new(),
         model,
     };

@@ -10,6 +10,9 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::middleware::{self, Next};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::formats::png;
@@ -20,9 +23,12 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
+use std::time::Duration;
 use subtle::ConstantTimeEq;
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Runtime;
+use tokio::sync::{Semaphore, watch};
+use tokio::task::JoinSet;
 
 const PAGE: &str = include_str!("view.html");
 /// Script that draws trees, both on this page and in a report.
@@ -31,6 +37,16 @@ pub(super) const TREES_SCRIPT: &str = include_str!("trees.js");
 const TREES_PLACE: &str = "/* trees.js */";
 /// Allowed side of a picture, pixels.
 const SIDES: std::ops::RangeInclusive<usize> = 16..=2048;
+/// Pictures that are drawn at once: the device draws one while the processor packs another. Further ones wait their turn.
+const PICTURES_AT_ONCE: usize = 2;
+/// Connections that are open at once; a browser opens six.
+const MAX_CONNECTIONS: usize = 64;
+/// Time within which a client must send the head of its next request, or its connection is closed; the page opens another one.
+const HEADERS_WITHIN: Duration = Duration::from_secs(5);
+/// Time that requests under way have to finish at the end, and pictures after them.
+const ENDS_WITHIN: Duration = Duration::from_secs(2);
+/// Pause after a connection could not be accepted.
+const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
 /// Side of the pictures that determine typical values, pixels.
 pub const TYPICAL_SIDE: usize = 64;
 
@@ -98,6 +114,8 @@ struct Viewer {
     shown: Arc<dyn PictureSource>,
     /// Tree of the vessels, which is found when the page first requests it.
     tree: Arc<TreeWork>,
+    /// Turns of pictures to be drawn.
+    turns: Arc<Semaphore>,
     token: String,
     port: u16,
 }
@@ -218,9 +236,15 @@ async fn tree(State(viewer): State<Arc<Viewer>>) -> Response {
     json_answer(answer)
 }
 
+/// Draws a picture when its turn comes. When a client leaves, the server drops this future, so a picture that nobody waits for any
+/// more is not begun.
 async fn frame(State(viewer): State<Arc<Viewer>>, Query(query): Query<PictureQuery>) -> Response {
-    let drawn = tokio::task::spawn_blocking(move || viewer.picture(&query)).await;
-    match drawn {
+    let turn = viewer.turns.clone().acquire_owned().await;
+    let drawn = tokio::task::spawn_blocking(move || {
+        let _turn = turn;
+        viewer.picture(&query)
+    });
+    match drawn.await {
         Ok(Ok(png)) => ([(header::CONTENT_TYPE, "image/png")], png).into_response(),
         Ok(Err(error @ Error::Config { .. })) => (StatusCode::BAD_REQUEST, format!("{error}\n")).into_response(),
         Ok(Err(error @ Error::NotReady(_))) => (StatusCode::SERVICE_UNAVAILABLE, format!("{error}\n")).into_response(),
@@ -232,6 +256,8 @@ async fn frame(State(viewer): State<Arc<Viewer>>, Query(query): Query<PictureQue
 /// A server that is listening.
 pub struct Server {
     runtime: Runtime,
+    /// Places of connections.
+    room: Arc<Semaphore>,
     listener: TcpListener,
     viewer: Arc<Viewer>,
 }
@@ -254,8 +280,10 @@ impl Server {
         let failed = || Error::io("listen on", address.to_string());
         let listener = runtime.block_on(TcpListener::bind(address)).map_err(failed())?;
         let port = listener.local_addr().map_err(failed())?.port();
+        let turns = Arc::new(Semaphore::new(PICTURES_AT_ONCE));
         let token = secret.iter().map(|b| format!("{b:02x}")).collect();
-        Ok(Server { runtime, listener, viewer: Arc::new(Viewer { shown, tree, token, port }) })
+        let room = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+        Ok(Server { runtime, room, listener, viewer: Arc::new(Viewer { shown, tree, turns, token, port }) })
     }
 
     /// Returns the address of the page.
@@ -263,12 +291,12 @@ impl Server {
         format!("http://127.0.0.1:{}/?token={}", self.viewer.port, self.viewer.token)
     }
 
-    /// Serves the page until `end` completes.
+    /// Serves the page until `end` completes, and then lets requests under way finish for a moment.
     ///
     /// # Errors
     /// [`Error::Io`].
     pub fn serve(self, end: impl Future<Output = ()> + Send + 'static) -> Result<()> {
-        let Server { runtime, listener, viewer } = self;
+        let Server { runtime, room, listener, viewer } = self;
         let app = Router::new()
             .route("/", get(|| async { Html(PAGE.replace(TREES_PLACE, TREES_SCRIPT)) }))
             .route("/info", get(info))
@@ -276,10 +304,162 @@ impl Server {
             .route("/tree", get(tree))
             .layer(middleware::from_fn_with_state(viewer.clone(), guard))
             .with_state(viewer.clone());
-        let served = axum::serve(listener, app).with_graceful_shutdown(async move {
+        let ended = async move {
             end.await;
             viewer.tree.stop();
-        });
-        runtime.block_on(served.into_future()).map_err(Error::io("serve", "the viewer's page"))
+        };
+        runtime.block_on(answer_until(ended, room, listener, app));
+        // A picture that is being drawn ends by itself; one that hangs in the driver does not hold the program up.
+        runtime.shutdown_timeout(ENDS_WITHIN);
+        Ok(())
+    }
+}
+
+/// Answers connections until `ended` completes.
+async fn answer_until(ended: impl Future<Output = ()>, room: Arc<Semaphore>, listener: TcpListener, app: Router) {
+    let mut connections = JoinSet::new();
+    // Connections end when the sender is dropped.
+    let (open, closing) = watch::channel(());
+    let accepting = async {
+        loop {
+            // Without room, further clients wait to be accepted.
+            let Ok(place) = room.clone().acquire_owned().await else { return };
+            match listener.accept().await {
+                Ok((stream, _)) => {
+                    let answered = answer(stream, app.clone(), closing.clone());
+                    connections.spawn(async move {
+                        let _place = place;
+                        answered.await;
+                    });
+                }
+                // Such as too many open files: that passes.
+                Err(_) => tokio::time::sleep(ACCEPT_AGAIN).await,
+            }
+            while connections.try_join_next().is_some() {}
+        }
+    };
+    tokio::select! {
+        () = ended => (),
+        () = accepting => (),
+    }
+    drop(open);
+    // What is left then is dropped with the connections.
+    let _ = tokio::time::timeout(ENDS_WITHIN, async { while connections.join_next().await.is_some() {} }).await;
+}
+
+/// Answers the requests of a connection until it ends, or `closing` does.
+async fn answer(stream: TcpStream, app: Router, mut closing: watch::Receiver<()>) {
+    let connection = http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(HEADERS_WITHIN)
+        .serve_connection(TokioIo::new(stream), TowerToHyperService::new(app));
+    let mut connection = std::pin::pin!(connection);
+    tokio::select! {
+        // A client that breaks its connection off is no error of the server.
+        _ = connection.as_mut() => return,
+        _ = closing.changed() => connection.as_mut().graceful_shutdown(),
+    }
+    let _ = connection.await;
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "tests")]
+mod tests {
+    use super::*;
+    use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+    use nertca_vk::kernels::tuning::Tuning;
+    use std::io::{Read, Write};
+    use std::net::TcpStream;
+    use std::sync::Mutex;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+    use std::sync::mpsc::{Receiver, Sender, channel};
+
+    /// A source that tells when it begins a picture, and then waits until it may go on.
+    struct Held {
+        begun: Sender<()>,
+        goes_on: Mutex<Receiver<()>>,
+        drawn: AtomicUsize,
+    }
+
+    impl PictureSource for Held {
+        fn taken(&self) -> Result<AngiogramGeometry> {
+            let c_arm = CArm {
+                primary_deg: 0.0,
+                secondary_deg: 0.0,
+                sid_mm: 1000.0,
+                sod_mm: 700.0,
+                pixel_mm: [1.0; 2],
+                offset_mm: [0.0; 2],
+                table_mm: [0.0; 3],
+            };
+            Ok(AngiogramGeometry { c_arm, image_size: [16, 16] })
+        }
+
+        fn phases(&self) -> u32 {
+            1
+        }
+
+        fn about(&self) -> Value {
+            json!({})
+        }
+
+        fn render(&self, _: &ViewRays, side: usize, _: u32, _: Quantity) -> Result<Vec<f32>> {
+            self.drawn.fetch_add(1, Ordering::SeqCst);
+            self.begun.send(()).unwrap();
+            self.goes_on.lock().unwrap().recv().unwrap();
+            Ok(vec![0.0; side * side])
+        }
+
+        fn range(&self, _: Quantity, _: u32) -> Result<f32> {
+            Ok(1.0)
+        }
+
+        fn model(&self) -> Result<Model> {
+            Err(Error::NotReady("there is no model".into()))
+        }
+    }
+
+    #[test]
+    fn pictures_whose_clients_have_left_are_not_drawn() {
+        let gpu = Gpu::open(&DeviceOptions::default()).unwrap();
+        let tuning = Tuning::for_device(gpu.info());
+        let ((begun, begins), (release, goes_on)) = (channel(), channel());
+        let held = Arc::new(Held { begun, goes_on: Mutex::new(goes_on), drawn: AtomicUsize::new(0) });
+        let server = Server::open(0, held.clone(), Arc::new(TreeWork::new(&gpu, tuning))).unwrap();
+        let (port, room) = (server.viewer.port, server.room.clone());
+        let picture = format!(
+            "GET /frame?token={}&primary=0&secondary=0&phase=0&component=total&projection=drr&size=16&low=0&high=1 \
+             HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nConnection: close\r\n\r\n",
+            server.viewer.token
+        );
+        let (end, ended) = tokio::sync::oneshot::channel::<()>();
+        let serving = std::thread::spawn(move || server.serve(async { drop(ended.await) }));
+        let ask = || {
+            let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
+            stream.write_all(picture.as_bytes()).unwrap();
+            stream
+        };
+        let mut first: Vec<TcpStream> = (0..PICTURES_AT_ONCE).map(|_| ask()).collect();
+        (0..PICTURES_AT_ONCE).for_each(|_| begins.recv().unwrap());
+        let abandoned: Vec<TcpStream> = (0..20).map(|_| ask()).collect();
+        let open = |connections: usize| {
+            while room.available_permits() != MAX_CONNECTIONS - connections {
+                std::thread::sleep(Duration::from_millis(5));
+            }
+        };
+        // One place is kept for the next client.
+        open(PICTURES_AT_ONCE + abandoned.len() + 1);
+        drop(abandoned);
+        open(PICTURES_AT_ONCE + 1);
+        let mut last = ask();
+        (0..PICTURES_AT_ONCE + 1).for_each(|_| release.send(()).unwrap());
+        for stream in first.iter_mut().chain([&mut last]) {
+            let mut answer = Vec::new();
+            stream.read_to_end(&mut answer).unwrap();
+            assert!(answer.starts_with(b"HTTP/1.1 200"));
+        }
+        assert_eq!(held.drawn.load(Ordering::SeqCst), PICTURES_AT_ONCE + 1, "those that someone waits for");
+        drop(end);
+        serving.join().unwrap().unwrap();
     }
 }

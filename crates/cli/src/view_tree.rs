@@ -9,7 +9,7 @@ use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::to_json;
 use serde_json::json;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// State of the search for the tree.
 enum TreeState {
@@ -46,13 +46,13 @@ pub struct TreeWork {
     gpu: Gpu,
     tuning: Tuning,
     current: Mutex<Current>,
-    stop: AtomicBool,
+    stop: Arc<AtomicBool>,
 }
 
 impl TreeWork {
     /// Prepares the search, which starts with the first request.
     pub fn new(gpu: &Gpu, tuning: Tuning) -> TreeWork {
-        TreeWork { gpu: gpu.clone(), tuning, current: Mutex::default(), stop: AtomicBool::new(false) }
+        TreeWork { gpu: gpu.clone(), tuning, current: Mutex::default(), stop: Arc::default() }
     }
 
     fn current(&self) -> MutexGuard<'_, Current> {
@@ -101,14 +101,20 @@ impl TreeWork {
         self.current().generation
     }
 
-    /// Stops the current search before its next phase.
+    /// Stops the current search before its next slice.
     pub fn stop(&self) {
         self.stop.store(true, Ordering::Relaxed);
     }
 
     fn tree(&self, generation: u64, model: &Model) -> Result<String> {
-        // The search has its own renderer, because the viewer's renderer goes on drawing pictures.
-        let renderer = Renderer::new(&self.gpu, model, self.tuning.clone())?;
+        // The search has its own renderer, because the viewer's renderer goes on drawing pictures, which pass between the slices of
+        // the search.
+        let (looks, stop) = (self.gpu.looks().clone(), self.stop.clone());
+        let interlude = move || {
+            looks.give_way();
+            if stop.load(Ordering::Relaxed) { Err(Error::Interrupted) } else { Ok(()) }
+        };
+        let renderer = Renderer::new(&self.gpu, model, self.tuning.clone())?.in_slices(Arc::new(interlude));
         let phases = (0..model.shown_phases()).collect();
         let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };
         let beat = vessel_trees(&renderer, model, &options, |done, of| {

@@ -65,7 +65,7 @@ pub fn run(global: &GlobalOptions, args: &WatchArgs) -> Result<()> {
     let stated = args.reading.stated(1)?.remove(0);
     let mut folder = Folder::new(&args.directory);
     folder.look()?;
-    prepare(&args.out)?;
+    let _lock = prepare(&args.out)?;
     let stop = stop_flag()?;
     let gpu = global.open_device()?;
     let tuning = global.tuning(&gpu, &config);
@@ -180,7 +180,8 @@ impl Watch<'_> {
             eprintln!("training failed: {problem}; it starts again with the next run");
             self.failed = true;
         }
-        let trains = session.state() == State::Running;
+        // Planning, and frames that training has not looked at yet, are work, too.
+        let trains = session.is_busy();
         if self.training && !trains {
             // A tree found during training shows an earlier state of the vessels.
             self.tree.forget();

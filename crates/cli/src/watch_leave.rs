@@ -1,10 +1,11 @@
 //! The result of `watch`: a run directory like that of `train`, with the runs it was made from as a dataset.
 
 use super::report::Report;
+use super::train::{LOCK, take_run};
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::checkpoint::{self, Checkpoint};
 use nertca_vk::error::{Error, Result};
-use nertca_vk::files;
+use nertca_vk::files::{self, Lock};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::import::intake::Intake;
 use nertca_vk::kernels::tuning::Tuning;
@@ -20,25 +21,42 @@ const DATA: &str = "data";
 /// Name of this dataset while it is being written.
 const PARTIAL_DATA: &str = ".partial-data";
 
-/// Makes a run directory. Fails if it already holds a run or cannot be written to.
-pub fn prepare(run: &Path) -> Result<()> {
-    if run.exists() {
-        let log = run.join("metrics.jsonl");
-        let checkpoint = checkpoint::list(run)?.pop().map(|(_, path)| path);
-        if let Some(old) = checkpoint.into_iter().chain([log, run.join(DATA)]).find(|path| path.exists()) {
-            let problem = format!("already contains `{}`: choose another directory", old.display());
-            return Err(Error::config("--out", run.display(), problem));
-        }
-    }
+/// Makes a run directory and takes it for this process. Fails if it already holds a run or cannot be written to, or while another
+/// process trains into it.
+pub fn prepare(run: &Path) -> Result<Lock> {
+    check_unused(run)?;
     files::create_directory(run)?;
     tempfile::tempfile_in(run).map_err(Error::io("create a temporary file in", run))?;
-    Ok(())
+    let lock = take_run(run)?;
+    // A process that had it before may have written a run meanwhile.
+    check_unused(run)?;
+    Ok(lock)
 }
 
-/// Removes a run directory if it is empty.
+fn check_unused(run: &Path) -> Result<()> {
+    if !run.exists() {
+        return Ok(());
+    }
+    let log = run.join("metrics.jsonl");
+    let checkpoint = checkpoint::list(run)?.pop().map(|(_, path)| path);
+    match checkpoint.into_iter().chain([log, run.join(DATA)]).find(|path| path.exists()) {
+        Some(old) => {
+            let problem = format!("already contains `{}`: choose another directory", old.display());
+            Err(Error::config("--out", run.display(), problem))
+        }
+        None => Ok(()),
+    }
+}
+
+/// Removes a run directory that holds nothing but its lock, which this process has.
 pub fn remove_empty(run: &Path) {
-    // A directory that is not empty cannot be removed and stays.
-    let _ = std::fs::remove_dir(run);
+    let lock = run.join(LOCK);
+    let is_other = |entry: std::io::Result<std::fs::DirEntry>| entry.is_ok_and(|entry| entry.path() != lock);
+    if std::fs::read_dir(run).is_ok_and(|mut entries| !entries.any(is_other)) {
+        // What cannot be removed stays.
+        let _ = std::fs::remove_file(&lock);
+        let _ = std::fs::remove_dir(run);
+    }
 }
 
 /// Result of training.
