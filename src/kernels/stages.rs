@@ -144,7 +144,7 @@ impl Build<'_> {
         } else {
             gpu.pipeline(code, lanes, self.constants)?
         };
-        Ok(Stage { pipeline: Arc::new(pipeline), push: PhantomData })
+        Ok(Stage { pipeline, push: PhantomData })
     }
 }
 

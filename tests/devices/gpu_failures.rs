@@ -80,14 +80,14 @@ fn use_device(gpu: &Gpu) -> Result<()> {
         let spec = [("m", shape.m), ("n", shape.n), ("k", shape.k), ("subgroups", 1)];
         drop(gpu.matrix_pipeline(kernel_code("peak_matrix")?, info.subgroup_size, &spec)?);
     }
-    let copy = Arc::new(gpu.pipeline(kernel_code("peak_copy")?, 64, &[])?);
+    let copy = gpu.pipeline(kernel_code("peak_copy")?, 64, &[])?;
     let copied = gpu.buffer("copied", 256, Memory::Device)?;
     let mut recording = Recording::timed(gpu, "session", 8)?;
     let given = [("from", Bound::Buffer(&objects.numbers)), ("to", Bound::Buffer(&copied))];
     recording.dispatch(&copy, Groups::Direct([1, 1, 1]), &given, &16u32)?;
     for name in IDLE_KERNELS {
         let code = kernel_code(name)?;
-        record_idle(&mut recording, &Arc::new(gpu.pipeline(code, 32, &[])?), code, &objects)?;
+        record_idle(&mut recording, &gpu.pipeline(code, 32, &[])?, code, &objects)?;
     }
     let commands = recording.finish()?;
     gpu.wait(commands.submit()?)?;

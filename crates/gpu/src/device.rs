@@ -6,6 +6,7 @@ use super::instance::{Instance, Loader, remedy};
 use super::lock::lock;
 use super::memory::DeviceMemory;
 use super::pace::PictureRequests;
+use super::pipeline::Keeper;
 use super::statistics::StatisticsKeeper;
 use crate::error::{Error, Result};
 use ash::{ext, khr, vk};
@@ -14,7 +15,7 @@ use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 use std::collections::BTreeSet;
 use std::ffi::CString;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, Mutex, MutexGuard, Weak};
 
 /// Options of opening a device.
 #[derive(Debug, Clone, Default)]
@@ -112,6 +113,8 @@ pub(super) struct Shared {
     pub(super) live_objects: AtomicU64,
     pub(super) info: DeviceInfo,
     looks: PictureRequests,
+    /// Pipelines that somebody keeps.
+    pub(super) kept_pipelines: Mutex<Weak<Keeper>>,
     /// Shaders that were recorded so far.
     pub(super) recorded: Mutex<BTreeSet<&'static str>>,
     pub(super) physical: vk::PhysicalDevice,
@@ -320,6 +323,7 @@ impl DeviceParts {
             live_objects: AtomicU64::new(0),
             info,
             looks: PictureRequests::default(),
+            kept_pipelines: Mutex::default(),
             recorded: Mutex::default(),
             physical,
             taken: MemoryUse { in_use: AtomicU64::new(0), limit: options.memory_limit.unwrap_or(u64::MAX) },

@@ -1,7 +1,8 @@
 //! Size of a submit: as large as possible without alarming a watchdog.
 
 use super::capabilities::DeviceInfo;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::ThreadId;
 use std::time::{Duration, Instant};
 
 /// Longest submit, seconds: systems reset devices that are busy for two seconds, and drawing of the screen waits behind each
@@ -10,30 +11,92 @@ pub const LONGEST_SUBMIT_S: f64 = 0.1;
 /// Longest submit during training while someone looks at pictures of the run, seconds. A picture waits for the two submits
 /// under way, which then take little longer than one frame of a display at 60 Hz.
 pub const LONGEST_SUBMIT_LOOKED_AT_S: f64 = 0.01;
+/// Longest slice of long work that live pictures pass before, such as scores, seconds: on every device, also where no watchdog
+/// limits a submit.
+pub const LONGEST_SLICE_S: f64 = 0.05;
 /// Time after a request for a picture during which another is expected: a user who turns a view or plays a beat makes several
 /// requests a second.
 const LOOKS_LAST: Duration = Duration::from_secs(1);
 /// Number of submits that are remembered: if the shortest of them took long, the reason was not waiting behind other work.
 const REMEMBERED: usize = 3;
 
-/// Time of the last request for a picture that waits behind the device's work. Clones share it.
+/// Live pictures, which pass before long work: when the last one was requested, and which are being drawn. Clones share it.
 #[derive(Debug, Clone, Default)]
-pub struct PictureRequests(Arc<Mutex<Option<Instant>>>);
+pub struct PictureRequests(Arc<Pictures>);
+
+#[derive(Debug, Default)]
+struct Pictures {
+    state: Mutex<PicturesState>,
+    /// Signals the end of a picture.
+    ended: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct PicturesState {
+    last: Option<Instant>,
+    /// Number of the next picture.
+    next: u64,
+    /// Pictures being drawn, by their numbers, and their threads.
+    drawn: Vec<(u64, ThreadId)>,
+}
+
+/// A live picture that is being drawn; it ends when this is dropped.
+#[derive(Debug)]
+pub struct PictureDrawn {
+    requests: PictureRequests,
+    number: u64,
+}
 
 impl PictureRequests {
-    /// Notes a request for a picture.
+    fn state(&self) -> MutexGuard<'_, PicturesState> {
+        self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Notes a request for a picture that waits behind the device's work.
     pub fn note(&self) {
         self.note_at(Instant::now());
     }
 
     fn note_at(&self, when: Instant) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(when);
+        self.state().last = Some(when);
+    }
+
+    /// Notes a request for a live picture, and that it is being drawn from now on, in this thread.
+    #[must_use]
+    pub fn begin(&self) -> PictureDrawn {
+        let mut state = self.state();
+        let number = state.next;
+        (state.next, state.last) = (number + 1, Some(Instant::now()));
+        state.drawn.push((number, std::thread::current().id()));
+        PictureDrawn { requests: self.clone(), number }
+    }
+
+    /// Waits for the live pictures that began before this call, as long work does between its slices. Pictures that begin later do
+    /// not prolong the wait. A thread that draws a picture itself does not wait, because others may wait for it.
+    pub fn give_way(&self) {
+        let (mut state, this) = (self.state(), std::thread::current().id());
+        let newest = state.next;
+        while must_wait(&state.drawn, newest, this) {
+            state = self.0.ended.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
     }
 
     /// Tells whether another request is likely.
-    fn are_recent(&self) -> bool {
-        is_recent(*self.0.lock().unwrap_or_else(PoisonError::into_inner), Instant::now())
+    pub fn are_recent(&self) -> bool {
+        is_recent(self.state().last, Instant::now())
     }
+}
+
+impl Drop for PictureDrawn {
+    fn drop(&mut self) {
+        self.requests.state().drawn.retain(|(number, _)| *number != self.number);
+        self.requests.0.ended.notify_all();
+    }
+}
+
+/// Tells whether long work in a thread waits for pictures with numbers below `newest`.
+fn must_wait(drawn: &[(u64, ThreadId)], newest: u64, this: ThreadId) -> bool {
+    drawn.iter().any(|(number, _)| *number < newest) && drawn.iter().all(|(_, thread)| *thread != this)
 }
 
 fn is_recent(last: Option<Instant>, now: Instant) -> bool {
@@ -147,6 +210,32 @@ mod tests {
         let (now, moment) = (Instant::now() + hour, Duration::from_millis(1));
         assert!(!is_recent(None, now) && is_recent(Some(now), now));
         assert!(is_recent(Some(now + moment - LOOKS_LAST), now) && !is_recent(Some(now - LOOKS_LAST), now));
+    }
+
+    #[test]
+    fn long_work_waits_for_the_pictures_that_began_before_and_for_no_others() {
+        let requests = PictureRequests::default();
+        requests.give_way();
+        let own = requests.begin();
+        // This thread draws itself.
+        requests.give_way();
+        let (told, hears) = std::sync::mpsc::channel();
+        let worker = {
+            let requests = requests.clone();
+            std::thread::spawn(move || {
+                requests.give_way();
+                told.send("passed").unwrap();
+            })
+        };
+        let later = requests.begin();
+        assert!(hears.try_recv().is_err(), "a picture is being drawn");
+        drop((own, later));
+        assert_eq!(hears.recv().unwrap(), "passed");
+        worker.join().unwrap();
+        // Pictures that began later do not count.
+        let (this, other) = (std::thread::current().id(), std::thread::spawn(|| ()).thread().id());
+        assert!(must_wait(&[(3, other), (4, other)], 4, this));
+        assert!(!must_wait(&[(4, other)], 4, this) && !must_wait(&[(3, other), (5, this)], 4, this));
     }
 
     #[test]

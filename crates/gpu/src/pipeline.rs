@@ -1,9 +1,11 @@
 //! Compute pipelines: SPIR-V, specialisation constants, binding table, limit checks.
 
 use super::device::{Gpu, Shared};
+use super::lock::lock;
 use crate::error::{Error, Result};
 use ash::vk;
-use std::sync::Arc;
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
 
 /// A compiled shader with its reflected declarations.
 #[derive(Debug)]
@@ -70,8 +72,27 @@ pub struct Pipeline {
     pub local_size: u32,
 }
 
+/// Pipelines are kept while this exists; see [`Gpu::keep_pipelines`].
+pub struct KeptPipelines {
+    _keeper: Arc<Keeper>,
+}
+
+/// Pipelines by what they were built from. They belong to the device's user, because they keep the device alive.
+#[derive(Default)]
+pub(super) struct Keeper {
+    pipelines: Mutex<HashMap<PipelineKey, Arc<Pipeline>>>,
+}
+
+#[derive(PartialEq, Eq, Hash)]
+struct PipelineKey {
+    name: &'static str,
+    local_size: u32,
+    spec: Vec<(String, u32)>,
+    subgroups: Subgroups,
+}
+
 /// Requirements of a kernel on its subgroups.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum Subgroups {
     /// No requirement.
     Any,
@@ -85,8 +106,8 @@ impl Gpu {
     /// # Errors
     /// [`Error::Internal`] for an unknown constant, [`Error::NoDevice`] when the kernel binds more than the device allows,
     /// [`Error::Vulkan`] when the driver refuses the shader.
-    pub fn pipeline(&self, code: &'static KernelCode, local_size: u32, spec: &[(&str, u32)]) -> Result<Pipeline> {
-        self.make_pipeline(code, local_size, spec, Subgroups::Any)
+    pub fn pipeline(&self, code: &'static KernelCode, local_size: u32, spec: &[(&str, u32)]) -> Result<Arc<Pipeline>> {
+        self.kept_or_new(code, local_size, spec, Subgroups::Any)
     }
 
     /// Builds a pipeline like [`Gpu::pipeline`], with full subgroups of the size
@@ -100,7 +121,7 @@ impl Gpu {
         code: &'static KernelCode,
         local_size: u32,
         spec: &[(&str, u32)],
-    ) -> Result<Pipeline> {
+    ) -> Result<Arc<Pipeline>> {
         if self.info().matrices.is_empty() {
             return Err(Error::Internal(format!(
                 "kernel {}: {} has no cooperative matrices",
@@ -108,7 +129,7 @@ impl Gpu {
                 self.info().name
             )));
         }
-        self.make_pipeline(code, local_size, spec, Subgroups::Full(self.info().matrix_subgroup))
+        self.kept_or_new(code, local_size, spec, Subgroups::Full(self.info().matrix_subgroup))
     }
 
     /// Builds a kernel whose subgroups must be full, with `size` invocations each: [`DeviceInfo::full_subgroups`] or
@@ -125,7 +146,7 @@ impl Gpu {
         local_size: u32,
         size: u32,
         spec: &[(&str, u32)],
-    ) -> Result<Pipeline> {
+    ) -> Result<Arc<Pipeline>> {
         let info = self.info();
         if ![info.full_subgroups, info.small_subgroups].contains(&Some(size))
             || !local_size.is_multiple_of(size)
@@ -134,7 +155,39 @@ impl Gpu {
             let problem = format!("{local_size} invocations are not a multiple of the subgroup size, {size}");
             return Err(Error::Internal(format!("kernel {}: {problem}", code.name)));
         }
-        self.make_pipeline(code, local_size, spec, Subgroups::Full(size))
+        self.kept_or_new(code, local_size, spec, Subgroups::Full(size))
+    }
+
+    /// Keeps the pipelines that are built from now on, so that building one again takes no time, until the result and those of all
+    /// other calls are dropped. A session that fits again and again needs the same ones each time.
+    #[must_use]
+    pub fn keep_pipelines(&self) -> KeptPipelines {
+        let mut kept = lock(&self.shared.kept_pipelines);
+        let keeper = kept.upgrade().unwrap_or_default();
+        *kept = Arc::downgrade(&keeper);
+        KeptPipelines { _keeper: keeper }
+    }
+
+    fn kept_or_new(
+        &self,
+        code: &'static KernelCode,
+        local_size: u32,
+        spec: &[(&str, u32)],
+        subgroups: Subgroups,
+    ) -> Result<Arc<Pipeline>> {
+        let keeper = lock(&self.shared.kept_pipelines).upgrade();
+        let Some(keeper) = keeper else {
+            return Ok(Arc::new(self.make_pipeline(code, local_size, spec, subgroups)?));
+        };
+        let spec_values = spec.iter().map(|(name, value)| ((*name).to_owned(), *value)).collect();
+        let key = PipelineKey { name: code.name, local_size, spec: spec_values, subgroups };
+        if let Some(known) = lock(&keeper.pipelines).get(&key) {
+            return Ok(known.clone());
+        }
+        // Another thread may build the same meanwhile: then one of them is kept.
+        let made = Arc::new(self.make_pipeline(code, local_size, spec, subgroups)?);
+        lock(&keeper.pipelines).insert(key, made.clone());
+        Ok(made)
     }
 
     fn make_pipeline(
