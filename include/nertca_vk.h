@@ -127,6 +127,26 @@
 #define NERTCA_STATE_FAILED 6
 
 /**
+ * Training uses the frame when it next takes frames in, if there are enough of them.
+ */
+#define NERTCA_USE_TRAINING 0
+
+/**
+ * The frame is kept for scores.
+ */
+#define NERTCA_USE_VALIDATION 1
+
+/**
+ * The phase of the frame is not known, because R-peaks do not cover its time.
+ */
+#define NERTCA_USE_NO_PHASE 2
+
+/**
+ * Training frames show the view at one phase only, so a preset that looks for what moves (`fast`, `fast-mlp`) leaves it out.
+ */
+#define NERTCA_USE_ONE_PHASE 3
+
+/**
  * Version of the ABI: of functions, structs and constants. A library serves callers that were built against its own number,
  * which is also the number in its soname.
  */
@@ -334,7 +354,9 @@ typedef struct {
 } nertca_geometry;
 
 /**
- * A calibrated angiogram.
+ * A calibrated angiogram. Frames of one size whose geometries agree within a tenth of a pixel, over a cube of 100 mm around the
+ * isocentre, are a view: a C-arm that reports its angles for each frame does so with noise. All frames of a view are used with the
+ * geometry of its first one.
  */
 typedef struct {
   /**
@@ -410,6 +432,36 @@ typedef struct {
    */
   size_t mask_stride_bytes;
 } nertca_frame;
+
+/**
+ * Phase, view and use of a frame.
+ */
+typedef struct {
+  /**
+   * `sizeof(nertca_frame_status)`.
+   */
+  size_t size;
+  /**
+   * One of `NERTCA_USE_*`.
+   */
+  uint32_t usage;
+  /**
+   * 1 when training used the frame, as it is now, when it last took frames in; 0 otherwise.
+   */
+  uint32_t taken_in;
+  /**
+   * Number of the view. Frames of one size whose geometries agree within a tenth of a pixel have the same number.
+   */
+  uint32_t view;
+  /**
+   * Phase nearest to the frame's time, from 0; -1 while it is not known.
+   */
+  int32_t phase;
+  /**
+   * Time after that phase, counted in phases, from -0.5 to 0.5.
+   */
+  double after_phase;
+} nertca_frame_status;
 
 /**
  * Progress of training.
@@ -540,6 +592,12 @@ typedef struct {
    * One of `NERTCA_QUALITY_*`.
    */
   uint32_t quality;
+  /**
+   * Time after `phase`, counted in phases, from 0 to below 1: such as the rest of what `nertca_reconstruction_beat_phase`
+   * returns. Between two phases, live quality draws line integrals of the form of `fast`, one set of moving Gaussians; exact
+   * quality also draws networks.
+   */
+  double after_phase;
 } nertca_view;
 
 /**
@@ -575,6 +633,24 @@ typedef struct {
    */
   double high;
 } nertca_image;
+
+/**
+ * Field that a live picture showed.
+ */
+typedef struct {
+  /**
+   * `sizeof(nertca_drawn)`.
+   */
+  size_t size;
+  /**
+   * Number of frames that it was fitted to; 0 for a checkpoint that was loaded.
+   */
+  uint32_t frames;
+  /**
+   * Number of iterations after which the oldest part of the picture was read.
+   */
+  uint32_t step;
+} nertca_drawn;
 
 /**
  * A regular grid of points in patient coordinates (LPS), left fastest, superior slowest.
@@ -990,10 +1066,50 @@ nertca_status nertca_reconstruction_add_frame(nertca_reconstruction *reconstruct
                                               const nertca_frame *frame);
 
 /**
+ * Removes a frame, whose memory is freed; the others keep their numbers. Training in the background takes that in like a new frame;
+ * training that has ended does so when it is next started. Callable from any thread.
+ *
+ * @return NERTCA_ERROR_ARGUMENT for a frame that was not added or was removed before; NERTCA_ERROR_BUSY while training in the
+ * background in a deterministic context.
+ */
+nertca_status nertca_reconstruction_remove_frame(nertca_reconstruction *reconstruction,
+                                                 uint32_t frame);
+
+/**
+ * Returns phase, view and use of a frame. Frames count from 0 in the order in which they were added. Callable from any thread.
+ *
+ * @return NERTCA_ERROR_ARGUMENT for a frame that was not added or was removed.
+ *
+ * # Safety
+ * `status` must be writable, with its size set.
+ */
+nertca_status nertca_reconstruction_frame_status(nertca_reconstruction *reconstruction,
+                                                 uint32_t frame,
+                                                 nertca_frame_status *status);
+
+/**
+ * Returns the phase of a time on the clock of the R-peaks, seconds, as for a frame with this time stamp: from 0 to below the number
+ * of phases, usually between two. Split into its whole part and the rest, it is `phase` and `after_phase` of a view. Callable from
+ * any thread.
+ *
+ * @return NERTCA_ERROR_NOT_READY for a time that R-peaks do not cover.
+ *
+ * # Safety
+ * `phase` must be writable.
+ */
+nertca_status nertca_reconstruction_beat_phase(nertca_reconstruction *reconstruction,
+                                               double time_s,
+                                               double *phase);
+
+/**
  * Sets the times of the R-peaks, seconds, in ascending order. Frames with time stamps get their phase from them: systole keeps
- * its length (310 ms, 35 % of the phases) and diastole takes the rest of the beat. A method with one set of moving Gaussians
+ * its length (310 ms, 35 % of the phases) and diastole takes the rest of the beat. The phases 0 to T - 1 are the middles of T equal
+ * parts of the beat, so a frame at an R-peak lies half a phase before phase 0, at T - 0.5. A method with one set of moving Gaussians
  * fits each frame at its own time within the phase. A call replaces the times given earlier, so that a growing list can be
- * given repeatedly. Callable from any thread.
+ * given repeatedly. A null `times_s` with a `count` of 0 clears them. Callable from any thread.
+ *
+ * @return NERTCA_ERROR_ARGUMENT for fewer than two times, and for times that do not increase; NERTCA_ERROR_BUSY while training in the
+ * background in a deterministic context.
  *
  * # Safety
  * `times_s` must be readable for `count` numbers.
@@ -1091,9 +1207,14 @@ nertca_status nertca_reconstruction_correction(nertca_reconstruction *reconstruc
                                                nertca_correction *correction);
 
 /**
- * Sets another geometry for a frame that was added, for example when the C-arm or an external calibration provides a better
- * one. Training takes it in like a new frame. Calibration starts from the stated geometry; with `calibrate.mode = off` the
- * reconstruction uses the stated geometry. Callable from any thread.
+ * Sets another geometry for a frame that was added, for example when the C-arm or an external calibration provides a better one.
+ * Training in the background takes it in like a new frame; training that has ended does so when it is next started. Calibration
+ * starts from the stated geometry; with `calibrate.mode = off` the reconstruction uses the stated geometry. Callable from any
+ * thread.
+ *
+ * A frame whose new geometry no other frame shares within a tenth of a pixel is a view of its own. Presets that look for what moves
+ * (`fast`, `fast-mlp`) leave it out while it is the only phase of its view: the log says so, and `nertca_reconstruction_frame_status`
+ * tells. `nertca_reconstruction_set_view_geometry` sets the geometry of a whole view.
  *
  * @return NERTCA_ERROR_ARGUMENT naming the field that is wrong, or for a frame that was not added; NERTCA_ERROR_BUSY while
  * training in the background in a deterministic context.
@@ -1104,6 +1225,19 @@ nertca_status nertca_reconstruction_correction(nertca_reconstruction *reconstruc
 nertca_status nertca_reconstruction_set_geometry(nertca_reconstruction *reconstruction,
                                                  uint32_t frame,
                                                  const nertca_geometry *geometry);
+
+/**
+ * Sets another geometry for a frame and for all other frames of its view, as `nertca_reconstruction_set_geometry` does for one.
+ * Callable from any thread.
+ *
+ * @return as `nertca_reconstruction_set_geometry`.
+ *
+ * # Safety
+ * `geometry` must be as long as its `size` says, and its matrix null or readable for 12 numbers.
+ */
+nertca_status nertca_reconstruction_set_view_geometry(nertca_reconstruction *reconstruction,
+                                                      uint32_t frame,
+                                                      const nertca_geometry *geometry);
 
 /**
  * Trains up to `iterations` more iterations in the calling thread, with the frames added so far. `progress` may be
@@ -1170,9 +1304,13 @@ nertca_status nertca_reconstruction_wait(nertca_reconstruction *reconstruction, 
  * training, from the current parameters: `NERTCA_QUALITY_LIVE` at display rates, from volumes whose refreshing takes at most a
  * fifth of the time; `NERTCA_QUALITY_EXACT` from the fields themselves.
  *
- * Callable from any thread; calls on one reconstruction draw one after the other.
+ * Callable from any thread; live pictures of one reconstruction are drawn one after the other. They wait for no long work: exact
+ * pictures, `_sample`, `_evaluate` and `_tree` are done in slices of some hundredths of a second, one call after the other, and live
+ * pictures pass between slices. During training in another thread a live picture shows the volumes there are, which that thread
+ * keeps up to date; `nertca_reconstruction_drawn` tells their age.
  *
- * @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT naming what is wrong.
+ * @return NERTCA_ERROR_CANCELLED for an exact picture that `nertca_reconstruction_cancel` ended; NERTCA_ERROR_NOT_READY before
+ * anything was trained or loaded; NERTCA_ERROR_ARGUMENT naming what is wrong.
  *
  * # Safety
  * `view` and `image` must be as long as their `size` says, and their pointers valid for the stated lengths.
@@ -1194,8 +1332,27 @@ nertca_status nertca_reconstruction_render_buffer(nertca_reconstruction *reconst
                                                   nertca_buffer *buffer);
 
 /**
+ * Returns which field the last live picture showed. Callable from any thread.
+ *
+ * @return NERTCA_ERROR_NOT_READY before the first live picture.
+ *
+ * # Safety
+ * `drawn` must be writable, with its size set.
+ */
+nertca_status nertca_reconstruction_drawn(nertca_reconstruction *reconstruction, nertca_drawn *drawn);
+
+/**
+ * Cancels the long calls that are under way on a reconstruction in other threads: `_evaluate`, `_tree`, `_sample` and exact
+ * pictures return NERTCA_ERROR_CANCELLED before their next slice. Calls that begin later are not affected, nor is training. Callable
+ * from any thread.
+ */
+nertca_status nertca_reconstruction_cancel(nertca_reconstruction *reconstruction);
+
+/**
  * Samples a volume into the caller's memory: attenuation per mm at each point of a grid, left fastest. Values outside the
- * reconstructed region are zero. Callable from any thread, also during training.
+ * reconstructed region are zero. Callable from any thread, also during training; live pictures pass.
+ *
+ * @return NERTCA_ERROR_CANCELLED when `nertca_reconstruction_cancel` ended the call.
  *
  * # Safety
  * `grid` must be as long as its `size` says; `values` must be writable for `count` floats.
@@ -1247,17 +1404,18 @@ nertca_status nertca_buffer_destroy(nertca_buffer *buffer);
 
 /**
  * Finds the vessels at all phases as trees of centrelines with radii. If all arrays of `tree` are null, the call searches and
- * returns the sizes of the arrays. Called again with arrays, it copies the trees found before, whatever training has done
- * since. The search takes seconds.
+ * returns the sizes of the arrays. Called again with arrays, it copies the trees found before, whatever training has done since.
+ * The search takes seconds; live pictures pass, and `nertca_reconstruction_cancel` ends it.
  *
  * Branches are listed phase by phase, each after its parent. Where `followed` is 1, all phases have the same branches with the
  * same number of points, and point i of a branch is the same material point at every phase; otherwise each phase has its own
  * branches. Motion along a vessel is not observed in projections: it is determined by smoothness alone. Callable from any
  * thread, also during training.
  *
- * @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT for a negative threshold or
- * length, for a dynamic field without vessels above the threshold, and where only some arrays are given; NERTCA_ERROR_BUFFER
- * when the arrays are too short: the counts are then the required ones.
+ * @return NERTCA_ERROR_CANCELLED when `nertca_reconstruction_cancel` ended the search; NERTCA_ERROR_NOT_READY before anything
+ * was trained or loaded; NERTCA_ERROR_ARGUMENT for a negative threshold or length, for a dynamic field without vessels above the
+ * threshold, and where only some arrays are given; NERTCA_ERROR_BUFFER when the arrays are too short: the counts are then the
+ * required ones.
  *
  * # Safety
  * `tree` must be as long as its `size` says, and its arrays null or writable for `branches` and `points` elements.
@@ -1301,7 +1459,9 @@ nertca_status nertca_reconstruction_set_true_tree(nertca_reconstruction *reconst
  * with the true vessels where these are known. `threshold_per_mm` is the attenuation from which the dynamic field counts as
  * vessel; 0 selects a fifth of `vessel_attenuation_per_mm`, or Otsu's threshold where that is unknown. Callable from any
  * thread, also during training. A library of an earlier version does not write fields that it does not know: set them to NaN
- * before the call if the version may be older.
+ * before the call if the version may be older. Live pictures pass meanwhile.
+ *
+ * @return NERTCA_ERROR_CANCELLED when `nertca_reconstruction_cancel` ended the call.
  *
  * # Safety
  * `scores` must be writable, with its size set.

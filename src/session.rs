@@ -8,6 +8,7 @@ mod corrected;
 mod engine;
 mod inbox;
 mod known;
+mod long_work;
 mod progress;
 mod truth;
 
@@ -23,14 +24,16 @@ use crate::render::grid::PatientGrid;
 use crate::render::live::Source;
 use crate::render::quantity::Quantity;
 use crate::render::renderer::{Renderer, Rendering};
-use crate::scan::gating::RPeaks;
+use crate::scan::gating::{BeatTime, RPeaks};
 use crate::trees::extract::{TreeOptions, vessel_trees};
 use crate::trees::tree::BeatTree;
 pub use corrected::CorrectedFrame;
+pub use engine::Drawn;
 use engine::{Control, Shared, lock, nothing_yet};
-use inbox::Inbox;
-pub use inbox::{FrameTime, NewFrame, SessionOptions};
+pub use inbox::{FrameStatus, FrameTime, FrameUse, NewFrame, SessionOptions};
+use inbox::{Inbox, Kept};
 use known::TrueShapes;
+use long_work::{LongCall, LongWork};
 pub use progress::{Observer, Progress, State};
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, TryLockError};
@@ -70,6 +73,7 @@ impl Session {
         let inbox = Inbox { options, views: Vec::new(), frames: Vec::new(), r_peaks: None };
         Ok(Session {
             shared: Arc::new(Shared {
+                _pipelines: gpu.as_ref().map(Gpu::keep_pipelines),
                 gpu,
                 tuning,
                 inbox: Mutex::new(inbox),
@@ -79,8 +83,20 @@ impl Session {
                 published: Mutex::default(),
                 calibration: Mutex::default(),
                 step: AtomicU32::new(0),
-                viewer: Mutex::new(None),
-                control: Mutex::new(Control { state: State::Idle, failure: None, worker: None, news: Instant::now() }),
+                viewer: Mutex::default(),
+                drawn: Mutex::default(),
+                fields: Mutex::default(),
+                long_work: LongWork::default(),
+                renews: AtomicBool::new(false),
+                taken: Mutex::default(),
+                control: Mutex::new(Control {
+                    state: State::Idle,
+                    failure: None,
+                    worker: None,
+                    news: Instant::now(),
+                    news_apart: Duration::MAX,
+                    waits_at: 0,
+                }),
                 changed: Condvar::new(),
                 stop: AtomicBool::new(false),
                 pause: AtomicBool::new(false),
@@ -101,23 +117,61 @@ impl Session {
     }
 
     /// States another geometry for a frame that was added, for example when the C-arm or an external calibration knows it
-    /// better. Training takes it in as it does a new frame.
+    /// better. Training takes it in as it does a new frame; training that has ended takes it in when it is started again. Returns
+    /// the use of the frame, which may be the only one of its view from now on.
     ///
     /// # Errors
     /// As [`Session::add_frame`]; [`Error::Config`] for a frame that was not added.
-    pub fn set_geometry(&self, frame: usize, geometry: Geometry) -> Result<()> {
-        self.change_frames(|inbox| inbox.set_geometry(frame, geometry))
+    pub fn set_geometry(&self, frame: usize, geometry: Geometry) -> Result<FrameUse> {
+        let usage = self.change_frames(|inbox| inbox.set_geometry(frame, geometry, false))?;
+        if usage == FrameUse::OnePhase {
+            tracing::warn!(
+                "frame {frame}: no training frame of another phase shares its new geometry within a tenth of a pixel, so \
+                 training does not use it until one does"
+            );
+        }
+        Ok(usage)
     }
 
-    fn change_frames(&self, change: impl FnOnce(&mut Inbox) -> Result<()>) -> Result<()> {
+    /// States another geometry for a frame and for all others of its view, as [`Session::set_geometry`] does.
+    ///
+    /// # Errors
+    /// As [`Session::set_geometry`].
+    pub fn set_view_geometry(&self, frame: usize, geometry: Geometry) -> Result<FrameUse> {
+        self.change_frames(|inbox| inbox.set_geometry(frame, geometry, true))
+    }
+
+    /// Removes a frame; the others keep their numbers. Training takes that in as it does a new frame.
+    ///
+    /// # Errors
+    /// As [`Session::set_geometry`].
+    pub fn remove_frame(&self, frame: usize) -> Result<()> {
+        self.change_frames(|inbox| inbox.remove(frame))
+    }
+
+    /// Returns phase, view and use of a frame.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for a frame that was not added, or was removed.
+    pub fn frame_status(&self, frame: usize) -> Result<FrameStatus> {
+        let taken = lock(&self.shared.taken).clone();
+        lock(&self.shared.inbox).status(frame, &taken)
+    }
+
+    /// Returns the time in the beat of a time in seconds by the R-peaks; none where these do not cover it.
+    pub fn beat_time(&self, time_s: f64) -> Option<BeatTime> {
+        lock(&self.shared.inbox).beat_time(FrameTime::TimeS(time_s))
+    }
+
+    fn change_frames<T>(&self, change: impl FnOnce(&mut Inbox) -> Result<T>) -> Result<T> {
         let mut inbox = lock(&self.shared.inbox);
         if inbox.options.deterministic && matches!(self.state(), State::Running | State::Waiting) {
             return Err(Error::Busy("a deterministic session accepts no frames while it trains".into()));
         }
-        change(&mut inbox)?;
+        let changed = change(&mut inbox)?;
         drop(inbox);
         self.announce();
-        Ok(())
+        Ok(changed)
     }
 
     /// How the reconstruction sees a frame, counted from 0 as they were added: as stated, or as calibration corrected it
@@ -128,7 +182,7 @@ impl Session {
     pub fn corrected_frame(&self, frame: usize) -> Result<CorrectedFrame> {
         let calibration = lock(&self.shared.calibration).clone().unwrap_or_else(|| Calibration::none(None));
         let inbox = lock(&self.shared.inbox);
-        let (frame, moment) = inbox.frame(frame)?;
+        let Kept { frame, moment, .. } = inbox.frame(frame)?;
         CorrectedFrame::new(
             &inbox.views[frame.view],
             frame,
@@ -142,20 +196,27 @@ impl Session {
         lock(&self.shared.calibration).clone()
     }
 
-    /// Gives the R-peaks by which frames with time stamps get their phase; replaces earlier ones.
-    pub fn set_r_peaks(&self, r_peaks: RPeaks) {
-        lock(&self.shared.inbox).r_peaks = Some(r_peaks);
-        self.announce();
+    /// Gives the R-peaks by which frames with time stamps get their phase; replaces earlier ones. None clears them.
+    ///
+    /// # Errors
+    /// [`Error::Busy`] while a deterministic session is training.
+    pub fn set_r_peaks(&self, r_peaks: Option<RPeaks>) -> Result<()> {
+        self.change_frames(|inbox| {
+            inbox.r_peaks = r_peaks;
+            Ok(())
+        })
     }
 
     fn announce(&self) {
         self.shared.version.fetch_add(1, Ordering::AcqRel);
         // The lock keeps the news from falling between a worker's look and its wait.
-        lock(&self.shared.control).news = Instant::now();
+        let (now, mut control) = (Instant::now(), lock(&self.shared.control));
+        (control.news_apart, control.news) = (now.saturating_duration_since(control.news), now);
+        drop(control);
         self.shared.changed.notify_all();
     }
 
-    /// Frames added so far.
+    /// Frames added so far, removed ones included.
     pub fn n_frames(&self) -> usize {
         lock(&self.shared.inbox).frames.len()
     }
@@ -175,6 +236,12 @@ impl Session {
         lock(&self.shared.control).state
     }
 
+    /// Tells whether training in the background has something to do: it trains, prepares to, or has not yet looked at the newest
+    /// frames. Waiting for frames is not being busy.
+    pub fn is_busy(&self) -> bool {
+        self.shared.is_busy()
+    }
+
     /// Error that ended training in the background, if one did.
     pub fn failure(&self) -> Option<String> {
         lock(&self.shared.control).failure.clone()
@@ -189,14 +256,22 @@ impl Session {
     pub fn train(&self, iterations: u32, observe: &mut Observer<'_>) -> Result<u32> {
         self.not_from_observer()?;
         let _alone = self.alone()?;
+        let trained = self.train_here(iterations, observe);
+        self.shared.renews.store(false, Ordering::Release);
+        trained
+    }
+
+    fn train_here(&self, iterations: u32, observe: &mut Observer<'_>) -> Result<u32> {
         let shared = &self.shared;
+        shared.renews.store(true, Ordering::Release);
         let first = {
             let mut engine = shared.visit();
-            shared.take_in_frames(&mut engine)?;
+            shared.take_in_frames(&mut engine, || ())?;
             engine.start_clock();
             engine.step()
         };
         loop {
+            shared.renew_viewer();
             let (progress, done) = {
                 let mut engine = shared.visit();
                 let length = engine.length();
@@ -333,12 +408,20 @@ impl Session {
         }
     }
 
-    /// Draws a view through baked volumes, at display rates, also while training; see [`crate::render::live::Live::render`].
+    /// Draws a view through baked volumes, at display rates, also while training or long work goes on in other threads; see
+    /// [`crate::render::live::Live::render`]. A `phase` may lie between two where moving Gaussians are the dynamic field.
     ///
     /// # Errors
     /// [`Error::NotReady`] before anything was trained or loaded; as [`crate::render::live::Live::render`].
-    pub fn render(&self, rays: &ViewRays, size: (usize, usize), phase: u32, quantity: Quantity) -> Result<Vec<f32>> {
-        self.shared.with_viewer(|live, step| live.render(step, rays, size, phase, quantity))
+    pub fn render(
+        &self,
+        rays: &ViewRays,
+        size: (usize, usize),
+        phase: impl Into<f64>,
+        quantity: Quantity,
+    ) -> Result<Vec<f32>> {
+        let phase = phase.into();
+        self.shared.with_viewer(phase, quantity, |live, at| live.render(at, rays, size, phase, quantity))
     }
 
     /// Draws a view as [`Session::render`] does, into a buffer on the device: `size.0` x `size.1` floats.
@@ -350,39 +433,71 @@ impl Session {
         target: &Buffer,
         rays: &ViewRays,
         size: (usize, usize),
-        phase: u32,
+        phase: impl Into<f64>,
         quantity: Quantity,
     ) -> Result<()> {
-        self.shared.with_viewer(|live, step| live.render_into(target, step, rays, size, phase, quantity))
+        let phase = phase.into();
+        self.shared.with_viewer(phase, quantity, |live, at| live.render_into(target, at, rays, size, phase, quantity))
     }
 
-    /// Draws a view through the fields themselves: slower, and exact.
+    /// Returns which field the last live picture showed; none before the first one.
+    pub fn drawn(&self) -> Option<Drawn> {
+        *lock(&self.shared.drawn)
+    }
+
+    /// Draws a view through the fields themselves: slower, and exact. A `phase` may lie between two where the dynamic field is known
+    /// there (see [`Renderer::render_at`]). Live pictures pass, as for all long work: [`Session::sample`], [`Session::trees`] and
+    /// [`Session::evaluate`].
     ///
     /// # Errors
-    /// As [`Session::render`].
-    pub fn render_fields(&self, rays: &ViewRays, size: (usize, usize), phase: u32) -> Result<Rendering> {
-        self.shared.with_viewer(|live, step| live.render_fields(step, rays, size, phase))
+    /// As [`Session::render`] and [`Renderer::render_at`]; [`Error::Interrupted`] after [`Session::cancel`].
+    pub fn render_fields(&self, rays: &ViewRays, size: (usize, usize), phase: f64) -> Result<Rendering> {
+        self.shared.with_fields(|live, step| live.render_fields(step, rays, size, phase))
     }
 
     /// Attenuation per mm at the points of a grid, of a component at a phase.
     ///
     /// # Errors
-    /// As [`Session::render`] and [`crate::render::renderer::Renderer::sample_patient`].
+    /// As [`Session::render_fields`] and [`crate::render::renderer::Renderer::sample_patient`].
     pub fn sample(&self, component: Component, phase: u32, grid: &PatientGrid) -> Result<Vec<f32>> {
-        self.shared.with_viewer(|live, step| live.renderer(step)?.sample_patient(component, phase, grid))
+        self.shared.with_fields(|live, step| live.renderer(step)?.sample_patient(component, phase, grid))
     }
 
     /// The vessels at all phases as trees of centrelines with radii, from the fields as they are after the iterations under
     /// way; see [`vessel_trees`] for the threshold and the minimum length.
     ///
     /// # Errors
-    /// [`Error::NotReady`] before anything was trained or loaded; those of [`vessel_trees`].
+    /// [`Error::NotReady`] before anything was trained or loaded; [`Error::Interrupted`] after [`Session::cancel`]; those of
+    /// [`vessel_trees`].
     pub fn trees(&self, threshold_per_mm: Option<f64>, least_branch_mm: Option<f64>) -> Result<BeatTree> {
+        self.trees_during(&self.shared.long_work.begin(), threshold_per_mm, least_branch_mm)
+    }
+
+    /// Finds [`Session::trees`] as a part of a longer call.
+    fn trees_during(
+        &self,
+        call: &LongCall,
+        threshold_per_mm: Option<f64>,
+        least_branch_mm: Option<f64>,
+    ) -> Result<BeatTree> {
         let (gpu, tuning) = self.shared.device()?;
         let model = self.checkpoint()?.model;
-        let renderer = Renderer::new(gpu, &model, tuning.clone())?;
+        let interlude = LongWork::interlude(gpu, &Arc::new(Mutex::new(call.clone())));
+        let renderer = Renderer::new(gpu, &model, tuning.clone())?.in_slices(interlude);
         let phases = (0..model.shown_phases()).collect();
-        vessel_trees(&renderer, &model, &TreeOptions { phases, threshold_per_mm, least_branch_mm }, |_, _| Ok(()))
+        vessel_trees(&renderer, &model, &TreeOptions { phases, threshold_per_mm, least_branch_mm }, |_, _| call.check())
+    }
+
+    /// Cancels the long work that is under way in other threads: scores, trees, volumes and exact pictures. It ends with
+    /// [`Error::Interrupted`] before its next slice; work that begins later is not affected.
+    pub fn cancel(&self) {
+        self.shared.long_work.cancel();
+    }
+
+    /// Calls a function before each slice of long work, in the thread that does the work, from the next call on: a place for work
+    /// that must not wait.
+    pub fn on_slices(&self, observer: Option<Arc<dyn Fn() + Send + Sync>>) {
+        self.shared.long_work.observe(observer);
     }
 
     /// Everything needed to continue, after the iterations under way.
@@ -418,7 +533,7 @@ impl Session {
         engine.training = None;
         engine.version = 0;
         *lock(&self.shared.calibration) = None;
-        self.shared.publish(Source::of(model));
+        self.shared.publish(Source::of(model), Some(0));
         self.shared.step.store(model.step, Ordering::Release);
         lock(&self.shared.control).state = State::Idle;
         engine.saved = Some(checkpoint);

@@ -58,9 +58,14 @@ pub unsafe extern "C" fn nertca_reconstruction_correction(
     })
 }
 
-/// Sets another geometry for a frame that was added, for example when the C-arm or an external calibration provides a better
-/// one. Training takes it in like a new frame. Calibration starts from the stated geometry; with `calibrate.mode = off` the
-/// reconstruction uses the stated geometry. Callable from any thread.
+/// Sets another geometry for a frame that was added, for example when the C-arm or an external calibration provides a better one.
+/// Training in the background takes it in like a new frame; training that has ended does so when it is next started. Calibration
+/// starts from the stated geometry; with `calibrate.mode = off` the reconstruction uses the stated geometry. Callable from any
+/// thread.
+///
+/// A frame whose new geometry no other frame shares within a tenth of a pixel is a view of its own. Presets that look for what moves
+/// (`fast`, `fast-mlp`) leave it out while it is the only phase of its view: the log says so, and `nertca_reconstruction_frame_status`
+/// tells. `nertca_reconstruction_set_view_geometry` sets the geometry of a whole view.
 ///
 /// @return NERTCA_ERROR_ARGUMENT naming the field that is wrong, or for a frame that was not added; NERTCA_ERROR_BUSY while
 /// training in the background in a deterministic context.
@@ -77,6 +82,29 @@ pub unsafe extern "C" fn nertca_reconstruction_set_geometry(
         // SAFETY: the header requires that `geometry` is null or as long as its size says, and that its matrix is null or has
         // 12 numbers.
         let geometry = unsafe { read(geometry)?.geometry() }?;
-        Ok(reconstruction.session.set_geometry(frame as usize, geometry)?)
+        reconstruction.session.set_geometry(frame as usize, geometry)?;
+        Ok(())
+    })
+}
+
+/// Sets another geometry for a frame and for all other frames of its view, as `nertca_reconstruction_set_geometry` does for one.
+/// Callable from any thread.
+///
+/// @return as `nertca_reconstruction_set_geometry`.
+///
+/// # Safety
+/// `geometry` must be as long as its `size` says, and its matrix null or readable for 12 numbers.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_set_view_geometry(
+    reconstruction: *mut nertca_reconstruction,
+    frame: u32,
+    geometry: *const nertca_geometry,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        // SAFETY: the header requires that `geometry` is null or as long as its size says, and that its matrix is null or has
+        // 12 numbers.
+        let geometry = unsafe { read(geometry)?.geometry() }?;
+        reconstruction.session.set_view_geometry(frame as usize, geometry)?;
+        Ok(())
     })
 }

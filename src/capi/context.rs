@@ -7,6 +7,7 @@ use crate::capi::options::{Options, text};
 use crate::capi::status::{Failure, NERTCA_ERROR_BUSY, Outcome, copy_text, nertca_status};
 use crate::capi::types::{nertca_log, nertca_vulkan, read};
 use crate::gpu::device::{Adoption, DeviceOptions, Gpu, QueueLock, list_devices};
+use crate::gpu::pipeline::KeptPipelines;
 use crate::kernels::cache::save_pipeline_cache;
 use crate::kernels::tuning::{Layers, Tuning};
 use ash::vk::{self, Handle};
@@ -25,6 +26,8 @@ pub struct nertca_context {
 pub(super) struct Context {
     pub gpu: Option<Gpu>,
     pub tuning: Option<Tuning>,
+    /// Reconstructions that follow one another need the same pipelines.
+    _pipelines: Option<KeptPipelines>,
     pub log: Dispatch,
     pub deterministic: bool,
     /// Number of reconstructions and buffers that are alive.
@@ -143,6 +146,7 @@ unsafe fn create(
             tracing::info!("{}: {}", gpu.info().name, tuning.reasons.join("; "));
         }
         let context = Arc::new(Context {
+            _pipelines: gpu.as_ref().map(Gpu::keep_pipelines),
             gpu,
             tuning,
             log: log.clone(),

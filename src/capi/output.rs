@@ -5,17 +5,18 @@ use crate::capi::context::{Claim, Context, nertca_context, on_context};
 use crate::capi::handles::{self, Kind};
 use crate::capi::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
 use crate::capi::shared_memory;
-use crate::capi::status::{Failure, NERTCA_OK, Outcome, nertca_status};
+use crate::capi::status::{Failure, NERTCA_ERROR_NOT_READY, NERTCA_OK, Outcome, nertca_status};
 use crate::capi::types::{
     NERTCA_COMPONENT_DYNAMIC, NERTCA_COMPONENT_STATIC, NERTCA_COMPONENT_TOTAL, NERTCA_PIXELS_F32, NERTCA_PIXELS_U8,
-    NERTCA_PROJECTION_DRR, NERTCA_PROJECTION_MIP, NERTCA_QUALITY_EXACT, NERTCA_QUALITY_LIVE, nertca_grid, nertca_image,
-    nertca_view, pixel_bytes, read, sides, stride,
+    NERTCA_PROJECTION_DRR, NERTCA_PROJECTION_MIP, NERTCA_QUALITY_EXACT, NERTCA_QUALITY_LIVE, nertca_drawn, nertca_grid,
+    nertca_image, nertca_view, pixel_bytes, read, sides, stride, write,
 };
 use crate::geometry::{MM_PER_UNIT, ViewRays};
 use crate::gpu::buffer::Buffer;
 use crate::model::component::Component;
 use crate::render::grid::PatientGrid;
 use crate::render::quantity::{Projection, Quantity};
+use crate::session::Drawn;
 use glam::DVec3;
 use std::sync::Arc;
 
@@ -44,7 +45,8 @@ impl Kind for SharedBuffer {
 struct CheckedView {
     rays: ViewRays,
     size: (usize, usize),
-    phase: u32,
+    /// Counted in phases; may lie between two.
+    phase: f64,
     quantity: Quantity,
     exact: bool,
 }
@@ -79,7 +81,12 @@ unsafe fn checked_view(view: *const nertca_view) -> Outcome<CheckedView> {
     let geometry = unsafe { view.geometry.geometry() }?;
     let rays = geometry.rays(size.0, size.1).map_err(|(field, problem)| Failure::argument(&field, problem))?;
     let quantity = Quantity { component, projection };
-    Ok(CheckedView { rays, size, phase: view.phase, quantity, exact })
+    if !(0.0..1.0).contains(&view.after_phase) {
+        let problem = format!("{} is not in the accepted range, 0 to below 1", view.after_phase);
+        return Err(Failure::argument("after_phase", problem));
+    }
+    let phase = f64::from(view.phase) + view.after_phase;
+    Ok(CheckedView { rays, size, phase, quantity, exact })
 }
 
 /// Draws a view: line integrals, or attenuation per mm.
@@ -98,9 +105,13 @@ fn draw(reconstruction: &Reconstruction, checked: &CheckedView) -> Outcome<Vec<f
 /// training, from the current parameters: `NERTCA_QUALITY_LIVE` at display rates, from volumes whose refreshing takes at most a
 /// fifth of the time; `NERTCA_QUALITY_EXACT` from the fields themselves.
 ///
-/// Callable from any thread; calls on one reconstruction draw one after the other.
+/// Callable from any thread; live pictures of one reconstruction are drawn one after the other. They wait for no long work: exact
+/// pictures, `_sample`, `_evaluate` and `_tree` are done in slices of some hundredths of a second, one call after the other, and live
+/// pictures pass between slices. During training in another thread a live picture shows the volumes there are, which that thread
+/// keeps up to date; `nertca_reconstruction_drawn` tells their age.
 ///
-/// @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT naming what is wrong.
+/// @return NERTCA_ERROR_CANCELLED for an exact picture that `nertca_reconstruction_cancel` ended; NERTCA_ERROR_NOT_READY before
+/// anything was trained or loaded; NERTCA_ERROR_ARGUMENT naming what is wrong.
 ///
 /// # Safety
 /// `view` and `image` must be as long as their `size` says, and their pointers valid for the stated lengths.
@@ -216,8 +227,40 @@ pub(super) unsafe fn grid_of(grid: *const nertca_grid) -> Outcome<(PatientGrid, 
     Ok((patient, component, grid.phase))
 }
 
+/// Returns which field the last live picture showed. Callable from any thread.
+///
+/// @return NERTCA_ERROR_NOT_READY before the first live picture.
+///
+/// # Safety
+/// `drawn` must be writable, with its size set.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_drawn(
+    reconstruction: *mut nertca_reconstruction,
+    drawn: *mut nertca_drawn,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        let none = || Failure::new(NERTCA_ERROR_NOT_READY, "no live picture was drawn yet");
+        let Drawn { frames, step } = reconstruction.session.drawn().ok_or_else(none)?;
+        // SAFETY: the header requires that `drawn` is null or as long as its size says.
+        unsafe { write(drawn, |size| nertca_drawn { size, frames, step }) }
+    })
+}
+
+/// Cancels the long calls that are under way on a reconstruction in other threads: `_evaluate`, `_tree`, `_sample` and exact
+/// pictures return NERTCA_ERROR_CANCELLED before their next slice. Calls that begin later are not affected, nor is training. Callable
+/// from any thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn nertca_reconstruction_cancel(reconstruction: *mut nertca_reconstruction) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        reconstruction.session.cancel();
+        Ok(())
+    })
+}
+
 /// Samples a volume into the caller's memory: attenuation per mm at each point of a grid, left fastest. Values outside the
-/// reconstructed region are zero. Callable from any thread, also during training.
+/// reconstructed region are zero. Callable from any thread, also during training; live pictures pass.
+///
+/// @return NERTCA_ERROR_CANCELLED when `nertca_reconstruction_cancel` ended the call.
 ///
 /// # Safety
 /// `grid` must be as long as its `size` says; `values` must be writable for `count` floats.

@@ -5,14 +5,18 @@ use crate::capi::context::{Claim, Context, nertca_context, on_context};
 use crate::capi::handles::{self, Kind};
 use crate::capi::options::{Options, text};
 use crate::capi::status::{
-    Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_BUSY, NERTCA_OK, Outcome, copy_text, nertca_status,
+    Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_BUSY, NERTCA_ERROR_NOT_READY, NERTCA_OK, Outcome, copy_text,
+    nertca_status,
 };
-use crate::capi::types::{nertca_frame, nertca_progress, read, state_code, write};
+use crate::capi::types::{
+    NERTCA_USE_NO_PHASE, NERTCA_USE_ONE_PHASE, NERTCA_USE_TRAINING, NERTCA_USE_VALIDATION, nertca_frame,
+    nertca_frame_status, nertca_progress, read, state_code, write,
+};
 use crate::checkpoint::Checkpoint;
 use crate::choice::Choice;
 use crate::config::{Config, Preset};
 use crate::scan::gating::RPeaks;
-use crate::session::{Progress, Session, SessionOptions};
+use crate::session::{FrameUse, Progress, Session, SessionOptions};
 use crate::trees::tree::BeatTree;
 use std::ffi::{c_char, c_void};
 use std::path::Path;
@@ -164,10 +168,93 @@ pub unsafe extern "C" fn nertca_reconstruction_add_frame(
     })
 }
 
+/// Removes a frame, whose memory is freed; the others keep their numbers. Training in the background takes that in like a new frame;
+/// training that has ended does so when it is next started. Callable from any thread.
+///
+/// @return NERTCA_ERROR_ARGUMENT for a frame that was not added or was removed before; NERTCA_ERROR_BUSY while training in the
+/// background in a deterministic context.
+#[unsafe(no_mangle)]
+pub extern "C" fn nertca_reconstruction_remove_frame(
+    reconstruction: *mut nertca_reconstruction,
+    frame: u32,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| Ok(reconstruction.session.remove_frame(frame as usize)?))
+}
+
+/// Returns phase, view and use of a frame. Frames count from 0 in the order in which they were added. Callable from any thread.
+///
+/// @return NERTCA_ERROR_ARGUMENT for a frame that was not added or was removed.
+///
+/// # Safety
+/// `status` must be writable, with its size set.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_frame_status(
+    reconstruction: *mut nertca_reconstruction,
+    frame: u32,
+    status: *mut nertca_frame_status,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        let found = reconstruction.session.frame_status(frame as usize)?;
+        // SAFETY: the header requires that `status` is null or as long as its size says.
+        unsafe {
+            write(status, |size| nertca_frame_status {
+                size,
+                usage: use_code(found.usage),
+                taken_in: u32::from(found.taken_in),
+                view: found.view as u32,
+                phase: found.beat_time.map_or(-1, |taken| taken.phase as i32),
+                after_phase: found.beat_time.map_or(0.0, |taken| taken.after_phase),
+            })
+        }
+    })
+}
+
+fn use_code(usage: FrameUse) -> u32 {
+    match usage {
+        FrameUse::Training => NERTCA_USE_TRAINING,
+        FrameUse::Validation => NERTCA_USE_VALIDATION,
+        FrameUse::NoPhase => NERTCA_USE_NO_PHASE,
+        FrameUse::OnePhase => NERTCA_USE_ONE_PHASE,
+    }
+}
+
+/// Returns the phase of a time on the clock of the R-peaks, seconds, as for a frame with this time stamp: from 0 to below the number
+/// of phases, usually between two. Split into its whole part and the rest, it is `phase` and `after_phase` of a view. Callable from
+/// any thread.
+///
+/// @return NERTCA_ERROR_NOT_READY for a time that R-peaks do not cover.
+///
+/// # Safety
+/// `phase` must be writable.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_beat_phase(
+    reconstruction: *mut nertca_reconstruction,
+    time_s: f64,
+    phase: *mut f64,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        if phase.is_null() {
+            return Err(Failure::argument("phase", "is null"));
+        }
+        if !time_s.is_finite() {
+            return Err(Failure::argument("time_s", format!("{time_s} is not finite")));
+        }
+        let uncovered = || Failure::new(NERTCA_ERROR_NOT_READY, format!("R-peaks do not cover the time {time_s} s"));
+        let found = reconstruction.session.beat_time(time_s).ok_or_else(uncovered)?;
+        // SAFETY: `phase` is not null, and the header requires that it can be written.
+        unsafe { phase.write_unaligned(found.phases(reconstruction.session.phases())) };
+        Ok(())
+    })
+}
+
 /// Sets the times of the R-peaks, seconds, in ascending order. Frames with time stamps get their phase from them: systole keeps
-/// its length (310 ms, 35 % of the phases) and diastole takes the rest of the beat. A method with one set of moving Gaussians
+/// its length (310 ms, 35 % of the phases) and diastole takes the rest of the beat. The phases 0 to T - 1 are the middles of T equal
+/// parts of the beat, so a frame at an R-peak lies half a phase before phase 0, at T - 0.5. A method with one set of moving Gaussians
 /// fits each frame at its own time within the phase. A call replaces the times given earlier, so that a growing list can be
-/// given repeatedly. Callable from any thread.
+/// given repeatedly. A null `times_s` with a `count` of 0 clears them. Callable from any thread.
+///
+/// @return NERTCA_ERROR_ARGUMENT for fewer than two times, and for times that do not increase; NERTCA_ERROR_BUSY while training in the
+/// background in a deterministic context.
 ///
 /// # Safety
 /// `times_s` must be readable for `count` numbers.
@@ -178,6 +265,9 @@ pub unsafe extern "C" fn nertca_reconstruction_set_r_peaks(
     count: usize,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
+        if times_s.is_null() && count == 0 {
+            return Ok(reconstruction.session.set_r_peaks(None)?);
+        }
         if times_s.is_null() {
             return Err(Failure::argument("times_s", "is null"));
         }
@@ -186,8 +276,7 @@ pub unsafe extern "C" fn nertca_reconstruction_set_r_peaks(
         }
         // SAFETY: the pointer is not null, and the header requires `count` numbers, which need no alignment.
         let times = (0..count).map(|i| unsafe { times_s.add(i).read_unaligned() }).collect::<Vec<_>>();
-        reconstruction.session.set_r_peaks(RPeaks::new(&times)?);
-        Ok(())
+        Ok(reconstruction.session.set_r_peaks(Some(RPeaks::new(&times)?))?)
     })
 }
 

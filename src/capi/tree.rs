@@ -7,17 +7,18 @@ use crate::trees::tree::{BeatTree, Branch};
 use std::sync::PoisonError;
 
 /// Finds the vessels at all phases as trees of centrelines with radii. If all arrays of `tree` are null, the call searches and
-/// returns the sizes of the arrays. Called again with arrays, it copies the trees found before, whatever training has done
-/// since. The search takes seconds.
+/// returns the sizes of the arrays. Called again with arrays, it copies the trees found before, whatever training has done since.
+/// The search takes seconds; live pictures pass, and `nertca_reconstruction_cancel` ends it.
 ///
 /// Branches are listed phase by phase, each after its parent. Where `followed` is 1, all phases have the same branches with the
 /// same number of points, and point i of a branch is the same material point at every phase; otherwise each phase has its own
 /// branches. Motion along a vessel is not observed in projections: it is determined by smoothness alone. Callable from any
 /// thread, also during training.
 ///
-/// @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT for a negative threshold or
-/// length, for a dynamic field without vessels above the threshold, and where only some arrays are given; NERTCA_ERROR_BUFFER
-/// when the arrays are too short: the counts are then the required ones.
+/// @return NERTCA_ERROR_CANCELLED when `nertca_reconstruction_cancel` ended the search; NERTCA_ERROR_NOT_READY before anything
+/// was trained or loaded; NERTCA_ERROR_ARGUMENT for a negative threshold or length, for a dynamic field without vessels above the
+/// threshold, and where only some arrays are given; NERTCA_ERROR_BUFFER when the arrays are too short: the counts are then the
+/// required ones.
 ///
 /// # Safety
 /// `tree` must be as long as its `size` says, and its arrays null or writable for `branches` and `points` elements.

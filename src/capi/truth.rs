@@ -123,7 +123,9 @@ unsafe fn copied<T: Copy>(name: &str, from: *const T, count: usize) -> Outcome<V
 /// with the true vessels where these are known. `threshold_per_mm` is the attenuation from which the dynamic field counts as
 /// vessel; 0 selects a fifth of `vessel_attenuation_per_mm`, or Otsu's threshold where that is unknown. Callable from any
 /// thread, also during training. A library of an earlier version does not write fields that it does not know: set them to NaN
-/// before the call if the version may be older.
+/// before the call if the version may be older. Live pictures pass meanwhile.
+///
+/// @return NERTCA_ERROR_CANCELLED when `nertca_reconstruction_cancel` ended the call.
 ///
 /// # Safety
 /// `scores` must be writable, with its size set.

@@ -138,7 +138,9 @@ pub struct nertca_geometry {
     pub matrix: *const f64,
 }
 
-/// A calibrated angiogram.
+/// A calibrated angiogram. Frames of one size whose geometries agree within a tenth of a pixel, over a cube of 100 mm around the
+/// isocentre, are a view: a C-arm that reports its angles for each frame does so with noise. All frames of a view are used with the
+/// geometry of its first one.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct nertca_frame {
@@ -200,6 +202,10 @@ pub struct nertca_view {
     pub projection: u32,
     /// One of `NERTCA_QUALITY_*`.
     pub quality: u32,
+    /// Time after `phase`, counted in phases, from 0 to below 1: such as the rest of what `nertca_reconstruction_beat_phase`
+    /// returns. Between two phases, live quality draws line integrals of the form of `fast`, one set of moving Gaussians; exact
+    /// quality also draws networks.
+    pub after_phase: f64,
 }
 
 /// Memory to draw into.
@@ -288,6 +294,45 @@ pub struct nertca_correction {
     /// Complete corrected geometry, including the displacement of the heart, as a row-major 3 x 4 projection from patient mm to
     /// homogeneous pixels (column, row; integers are pixel centres): a value for `nertca_geometry.matrix`.
     pub matrix: [[f64; 4]; 3],
+}
+
+/// Training uses the frame when it next takes frames in, if there are enough of them.
+pub const NERTCA_USE_TRAINING: u32 = 0;
+/// The frame is kept for scores.
+pub const NERTCA_USE_VALIDATION: u32 = 1;
+/// The phase of the frame is not known, because R-peaks do not cover its time.
+pub const NERTCA_USE_NO_PHASE: u32 = 2;
+/// Training frames show the view at one phase only, so a preset that looks for what moves (`fast`, `fast-mlp`) leaves it out.
+pub const NERTCA_USE_ONE_PHASE: u32 = 3;
+
+/// Phase, view and use of a frame.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_frame_status {
+    /// `sizeof(nertca_frame_status)`.
+    pub size: usize,
+    /// One of `NERTCA_USE_*`.
+    pub usage: u32,
+    /// 1 when training used the frame, as it is now, when it last took frames in; 0 otherwise.
+    pub taken_in: u32,
+    /// Number of the view. Frames of one size whose geometries agree within a tenth of a pixel have the same number.
+    pub view: u32,
+    /// Phase nearest to the frame's time, from 0; -1 while it is not known.
+    pub phase: i32,
+    /// Time after that phase, counted in phases, from -0.5 to 0.5.
+    pub after_phase: f64,
+}
+
+/// Field that a live picture showed.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_drawn {
+    /// `sizeof(nertca_drawn)`.
+    pub size: usize,
+    /// Number of frames that it was fitted to; 0 for a checkpoint that was loaded.
+    pub frames: u32,
+    /// Number of iterations after which the oldest part of the picture was read.
+    pub step: u32,
 }
 
 /// Vessels as trees of centrelines with radii: parameters of the search, and arrays for its result.
@@ -418,8 +463,14 @@ macro_rules! versioned {
         }
     )* };
 }
-versioned!(nertca_log nertca_geometry nertca_frame nertca_view nertca_image nertca_grid nertca_progress nertca_correction
-       nertca_tree);
+versioned!(nertca_log nertca_geometry nertca_frame nertca_image nertca_grid nertca_progress nertca_correction nertca_tree
+       nertca_frame_status nertca_drawn);
+
+// SAFETY: integers, floats and pointers after a `usize`.
+unsafe impl Versioned for nertca_view {
+    const NAME: &'static str = "nertca_view";
+    const FIRST: usize = std::mem::offset_of!(nertca_view, after_phase);
+}
 
 // SAFETY: integers, pointers and optional function pointers after a `usize`.
 unsafe impl Versioned for nertca_vulkan {

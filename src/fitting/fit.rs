@@ -244,6 +244,11 @@ pub trait Fit: Send {
         None
     }
 
+    /// Tells whether the field of earlier data is shown, until the fit has a better one.
+    fn shows_earlier(&self) -> bool {
+        false
+    }
+
     /// Runs one submit of iterations towards `until` and returns the losses that became known. Work may be in flight afterwards
     /// unless `until` is reached. No losses mean that `until` was reached before, or that the first iteration is still being
     /// prepared.

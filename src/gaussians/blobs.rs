@@ -1,7 +1,7 @@
 //! Drawing of Gaussians along rays and at the cells of volumes.
 
 use crate::error::{Error, Result};
-use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, Units, scales};
+use crate::gaussians::field::{DynamicGaussians, Gaussians, Units, scales};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
@@ -13,7 +13,7 @@ use crate::kernels::stages::{Build, Stage, vec4_variant};
 use crate::kernels::tuning::Tuning;
 use glam::{DMat3, DQuat, DVec3};
 use std::ops::Range;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// Sides of the tile of pixels that a workgroup draws.
 const TILE: u32 = 8;
@@ -79,10 +79,6 @@ struct BlobSet {
     blobs: Buffer,
     /// Range of each phase's Gaussians in the buffer.
     phases: Vec<Range<u32>>,
-    /// The deformable set, if the field is one.
-    deformable: Option<DeformableGaussians>,
-    /// Whether so many Gaussians overlap that the strongest ones of a ray do not determine the maximum of their sum.
-    is_crowd: bool,
 }
 
 impl BlobSet {
@@ -93,13 +89,14 @@ impl BlobSet {
             all.extend(field.at(phase).iter().map(|g| Blob::of(g, sets.units, &sets.setup)));
             phases.push(first..all.len() as u32);
         }
-        Ok(BlobSet {
-            blobs: upload(gpu, all)?,
-            phases,
-            deformable: field.deformable().cloned(),
-            is_crowd: sets.is_crowd,
-        })
+        Ok(BlobSet { blobs: upload(gpu, all)?, phases })
     }
+}
+
+/// The field, which is uploaded when it is first drawn: pictures at display rates do not need it here.
+struct Shown {
+    field: DynamicGaussians,
+    on_device: Option<BlobSet>,
 }
 
 /// Creates a buffer of Gaussians, which is never empty.
@@ -112,42 +109,45 @@ fn upload(gpu: &Gpu, blobs: Vec<Blob>) -> Result<Buffer> {
 pub struct Blobs {
     gpu: Gpu,
     kernels: BlobKernels,
-    set: Mutex<BlobSet>,
+    shown: Mutex<Shown>,
 }
 
 impl Blobs {
-    /// Uploads a field to the device.
+    /// Prepares to draw a field.
     ///
     /// # Errors
-    /// [`Error::OutOfMemory`]; other device errors.
+    /// Errors of [`Gpu::pipeline`].
     pub fn new(gpu: &Gpu, tuning: &Tuning, field: &DynamicGaussians) -> Result<Blobs> {
-        let set = Mutex::new(BlobSet::new(gpu, field)?);
-        Ok(Blobs { gpu: gpu.clone(), kernels: BlobKernels::new(gpu, tuning)?, set })
+        let shown = Mutex::new(Shown { field: field.clone(), on_device: None });
+        Ok(Blobs { gpu: gpu.clone(), kernels: BlobKernels::new(gpu, tuning)?, shown })
     }
 
     /// Replaces the field to be drawn. Commands that were recorded before draw the old field.
-    ///
-    /// # Errors
-    /// Errors of [`Blobs::new`].
-    pub fn replace(&self, field: &DynamicGaussians) -> Result<()> {
-        let new = BlobSet::new(&self.gpu, field)?;
-        *self.set.lock().unwrap_or_else(PoisonError::into_inner) = new;
-        Ok(())
+    pub fn replace(&self, field: &DynamicGaussians) {
+        *self.shown() = Shown { field: field.clone(), on_device: None };
+    }
+
+    fn shown(&self) -> MutexGuard<'_, Shown> {
+        self.shown.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Returns the Gaussians at a phase.
     ///
     /// # Errors
-    /// [`Error::Internal`] for a phase the field does not have.
+    /// [`Error::Internal`] for a phase the field does not have; [`Error::OutOfMemory`]; other device errors.
     pub fn at(&self, phase: u32) -> Result<BlobList> {
-        let set = self.set.lock().unwrap_or_else(PoisonError::into_inner);
+        let Shown { field, on_device } = &mut *self.shown();
+        let set = match on_device {
+            Some(set) => set,
+            none => none.insert(BlobSet::new(&self.gpu, field)?),
+        };
         let missing = || Error::Internal(format!("there are no Gaussians of phase {phase}"));
         Ok(BlobList { blobs: set.blobs.clone(), range: set.phases.get(phase as usize).ok_or_else(missing)?.clone() })
     }
 
     /// Tells whether the field is known between phases.
     pub fn move_between_phases(&self) -> bool {
-        self.set.lock().unwrap_or_else(PoisonError::into_inner).deformable.is_some()
+        self.shown().field.deformable().is_some()
     }
 
     /// Returns the Gaussians of a deformable set at a phase, which may be fractional; none for another field, which is known only at
@@ -157,8 +157,8 @@ impl Blobs {
     /// [`Error::OutOfMemory`]; other device errors.
     pub fn between(&self, phase: f64) -> Result<Option<BlobList>> {
         let blobs: Vec<Blob> = {
-            let set = self.set.lock().unwrap_or_else(PoisonError::into_inner);
-            let Some(deformable) = &set.deformable else { return Ok(None) };
+            let shown = self.shown();
+            let Some(deformable) = shown.field.deformable() else { return Ok(None) };
             let Gaussians { units, setup, .. } = &deformable.rest;
             deformable.at(phase).iter().map(|g| Blob::of(g, *units, setup)).collect()
         };
@@ -185,7 +185,7 @@ impl Blobs {
         let tiles = image_width.div_ceil(TILE) * rows.div_ceil(TILE);
         let push = GaussianRays { n_rays, image_width, first_blob: range.start, n_blobs: range.len() as u32 };
         let bound = [(Binding::blobs, blobs.into())];
-        let is_crowd = maxima && self.set.lock().unwrap_or_else(PoisonError::into_inner).is_crowd;
+        let is_crowd = maxima && self.shown().field.rows().is_crowd;
         let stage = if maxima && !is_crowd { &self.kernels.rays_maxima } else { &self.kernels.rays };
         let (groups, find) = (|| Groups::Direct([tiles, 1, 1]), |name| buffers.find(name));
         dispatch_finding(recording, stage, groups(), &bound, find, push)?;

@@ -20,6 +20,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Maximum number of recorded pictures that are kept; a display needs far fewer.
 const MAX_RECORDED: usize = 256;
+/// Pixels of recorded pictures beyond which they are discarded: 64 MiB on the device.
+const MAX_RECORDED_PIXELS: usize = 1 << 24;
 
 /// Builds the stage that writes a picture into a buffer; the other stages are those of fits.
 ///
@@ -209,7 +211,8 @@ impl Pictures {
         if let Some(picture) = state.recorded.get(&key) {
             return Ok((units, picture.clone()));
         }
-        if state.recorded.len() >= MAX_RECORDED {
+        let pixels = state.recorded.keys().map(|key| key.columns * key.rows).sum::<usize>();
+        if state.recorded.len() >= MAX_RECORDED || pixels + key.columns * key.rows > MAX_RECORDED_PIXELS {
             state.recorded.clear();
         }
         let picture = Arc::new(self.record(&state.field, key)?);

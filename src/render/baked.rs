@@ -39,6 +39,8 @@ pub struct Baked {
 
 /// Maximum number of recorded frames kept; a viewer in use has far fewer.
 const MAX_RECORDED: usize = 256;
+/// Pixels of recorded frames beyond which they are discarded: 64 MiB on the device.
+const MAX_RECORDED_PIXELS: usize = 1 << 24;
 
 /// Columns, rows, phase, quantity.
 type RecordedKey = (usize, usize, u32, Quantity);
@@ -113,6 +115,14 @@ impl Baked {
     }
 
     fn bake_field(&self, field: Component, phase: u32) -> Result<Commands> {
+        self.fill(field, phase, &self.cells(field, phase)?)
+    }
+
+    /// Samples a single field at the cells of its volume, in units of its scale.
+    ///
+    /// # Errors
+    /// As [`Renderer::sample`].
+    pub fn cells(&self, field: Component, phase: u32) -> Result<Vec<f16>> {
         let setup = &self.renderer.setup;
         let (grid, gain) = match field {
             Component::Static => (&self.static_grid, setup.static_gain),
@@ -120,13 +130,22 @@ impl Baked {
         };
         // In units of the field's scale, values are near 1 and f16 loses a thousandth at most.
         let cells = self.renderer.sample(field, phase, grid)?;
-        let cells: Vec<f16> = cells.iter().map(|x| f16::from_f32(x / gain)).collect();
+        Ok(cells.iter().map(|x| f16::from_f32(x / gain)).collect())
+    }
+
+    /// Fills the volume of a single field with cells that [`Baked::cells`] returned. The copy may still be under way, as after
+    /// [`Baked::bake`]. No picture may be under way.
+    ///
+    /// # Errors
+    /// [`Error::OutOfMemory`]; other device errors.
+    pub fn fill(&self, field: Component, phase: u32, cells: &[f16]) -> Result<Commands> {
+        let grid = if field == Component::Static { &self.static_grid } else { &self.dynamic_grid };
         let mut volumes = self.volumes.lock().unwrap_or_else(PoisonError::into_inner);
         match &mut volumes[slot(field, phase)] {
-            Some(volume) => Ok(volume.fill(&cells)?),
+            Some(volume) => Ok(volume.fill(cells)?),
             none => {
                 let volume = self.renderer.gpu.image_3d("baked", grid.size)?;
-                let filling = volume.fill(&cells)?;
+                let filling = volume.fill(cells)?;
                 *none = Some(volume);
                 Ok(filling)
             }
@@ -240,7 +259,8 @@ impl Baked {
         if let Some(recorded) = all.get(&key) {
             return Ok(recorded.clone());
         }
-        if all.len() >= MAX_RECORDED {
+        let pixels = all.keys().map(|(width, height, ..)| width * height).sum::<usize>();
+        if all.len() >= MAX_RECORDED || pixels + width * height > MAX_RECORDED_PIXELS {
             all.clear();
         }
         let (gpu, pixels) = (&self.renderer.gpu, (width * height) as u32);

@@ -1,7 +1,7 @@
 //! Views of a run while it trains: baked volumes that are refreshed as fast as the device can afford.
 
 use crate::config::Config;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::fitting::fit::FieldFeed;
 use crate::gaussians::field::GaussianFeed;
 use crate::geometry::ViewRays;
@@ -13,16 +13,18 @@ use crate::model::Model;
 use crate::model::component::Component;
 use crate::model::scene::Scene;
 use crate::render::baked::Baked;
-use crate::render::quantity::Quantity;
-use crate::render::renderer::{Renderer, Rendering};
+use crate::render::quantity::{Projection, Quantity};
+use crate::render::renderer::{Interlude, Renderer, Rendering};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, PoisonError};
-use std::time::Instant;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 /// Side of a cell of the dynamic field: finer than a thin vessel, coarse enough to be baked again and again.
 const CELL_MM: f64 = 0.8;
 /// Pause after a refresh, as a multiple of the time that it took.
 const REST: u32 = 4;
+/// Time after a picture during which the volumes that it showed are kept up to date.
+const SHOWN_LATELY: Duration = Duration::from_secs(1);
 
 /// Data of a run in training that a view needs.
 #[derive(Clone)]
@@ -40,8 +42,18 @@ impl Source {
     }
 }
 
-/// Draws the present state of a source.
+/// When volumes that are older than the source's present iteration are baked anew.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refresh {
+    /// By the picture that shows them, unless the last refresh was too recent.
+    Now,
+    /// By [`Live::refresh_beside`] in another thread; pictures show the volumes there are meanwhile.
+    Beside,
+}
+
+/// Draws the present state of a source. Pictures are drawn one after the other; volumes may be baked beside them.
 pub struct Live {
+    gpu: Gpu,
     baked: Baked,
     config: Config,
     scene: Scene,
@@ -49,50 +61,79 @@ pub struct Live {
     gaussians: Option<GaussianFeed>,
     /// Count of the feed's changes at the field that is drawn.
     gaussians_at: AtomicU64,
-    /// Iteration the static field and each phase were baked at.
-    baked_at: Vec<u32>,
+    /// Held while a picture is drawn, and while a volume is replaced.
+    drawing: Mutex<()>,
+    freshness: Mutex<Freshness>,
+}
+
+/// Age of volumes: the static field, then each phase.
+struct Freshness {
+    volumes: Vec<VolumeAge>,
     rest_until: Instant,
 }
 
+#[derive(Clone, Copy, Default)]
+struct VolumeAge {
+    /// Iteration it was baked at; none before.
+    baked_at: Option<u32>,
+    /// When a picture last showed it.
+    shown: Option<Instant>,
+}
+
+/// Field and phase of a volume.
+fn volume(slot: usize) -> (Component, u32) {
+    if slot == 0 { (Component::Static, 0) } else { (Component::Dynamic, slot as u32 - 1) }
+}
+
 impl Live {
-    /// Prepares to draw; bakes nothing yet.
+    /// Prepares to draw; bakes nothing yet. With an interlude, it works in slices (see [`Renderer::in_slices`]).
     ///
     /// # Errors
     /// Device errors.
-    pub fn new(gpu: &Gpu, source: &Source, tuning: Tuning) -> Result<Live> {
+    pub fn new(gpu: &Gpu, source: &Source, tuning: Tuning, interlude: Option<Interlude>) -> Result<Live> {
         let model = &source.outline;
-        let renderer = Arc::new(Renderer::new(gpu, model, tuning)?);
+        let renderer = Renderer::new(gpu, model, tuning)?;
+        let renderer = Arc::new(match interlude {
+            Some(interlude) => renderer.in_slices(interlude),
+            None => renderer,
+        });
         if !source.feed.own.is_empty() {
             renderer.follow_fit(&source.feed.own);
         }
+        let volumes = vec![VolumeAge::default(); 1 + model.param_map.phases];
         Ok(Live {
+            gpu: gpu.clone(),
             baked: Baked::for_display(renderer, model, CELL_MM),
             config: model.config.clone(),
             scene: model.scene.clone(),
             params: source.feed.params.clone(),
             gaussians: source.feed.gaussians.clone(),
             gaussians_at: AtomicU64::new(u64::MAX),
-            baked_at: vec![0; 1 + model.param_map.phases],
-            rest_until: Instant::now(),
+            drawing: Mutex::default(),
+            freshness: Mutex::new(Freshness { volumes, rest_until: Instant::now() }),
         })
     }
 
-    /// Draws a view as [`Baked::render`] does. A volume older than `step`, the source's present iteration, is baked anew unless
-    /// the last refresh was too recent: refreshing takes at most a fifth of the time.
+    /// Draws a view as [`Baked::render`] does. A volume that was never baked is baked first. One that is older than `step`, the
+    /// source's present iteration, is baked anew as `refresh` says; refreshing takes at most a fifth of the time. A `phase` may
+    /// lie between two for line integrals of one set of Gaussians that moves.
     ///
     /// # Errors
-    /// As [`Renderer::render`].
+    /// As [`Renderer::render`]; [`Error::Config`] for a phase between two where it cannot be drawn.
     pub fn render(
-        &mut self,
-        step: u32,
+        &self,
+        at: (u32, Refresh),
         rays: &ViewRays,
         size: (usize, usize),
-        phase: u32,
+        phase: f64,
         quantity: Quantity,
     ) -> Result<Vec<f32>> {
-        self.follow_gaussians()?;
-        let _under_way = self.refresh(step, phase, quantity)?;
-        self.baked.render(rays, size.0, size.1, phase, quantity)
+        let _alone = self.alone();
+        let _under_way = self.follow_and_refresh(at, phase, quantity)?;
+        if phase.fract() == 0.0 {
+            return self.baked.render(rays, size.0, size.1, phase as u32, quantity);
+        }
+        self.between(rays, size, phase, quantity)
     }
 
     /// Draws a view as [`Live::render`] does, into a buffer on the device.
@@ -100,46 +141,164 @@ impl Live {
     /// # Errors
     /// As [`Baked::render_into`].
     pub fn render_into(
-        &mut self,
+        &self,
         target: &Buffer,
-        step: u32,
+        at: (u32, Refresh),
         rays: &ViewRays,
         size: (usize, usize),
-        phase: u32,
+        phase: f64,
         quantity: Quantity,
     ) -> Result<()> {
-        self.follow_gaussians()?;
-        let _under_way = self.refresh(step, phase, quantity)?;
-        self.baked.render_into(target, rays, size, phase, quantity)
+        let _alone = self.alone();
+        let _under_way = self.follow_and_refresh(at, phase, quantity)?;
+        if phase.fract() == 0.0 {
+            return self.baked.render_into(target, rays, size, phase as u32, quantity);
+        }
+        target.check_range(0, (size.0 * size.1 * 4) as u64)?;
+        Ok(self.gpu.upload(target, 0, &self.between(rays, size, phase, quantity)?)?)
     }
 
-    fn refresh(&mut self, step: u32, phase: u32, quantity: Quantity) -> Result<Vec<Commands>> {
+    fn between(&self, rays: &ViewRays, size: (usize, usize), phase: f64, quantity: Quantity) -> Result<Vec<f32>> {
+        let of = |component| Quantity { component, ..quantity };
+        let Some(mut image) = self.baked.renderer().show_between(rays, size, phase, of(Component::Dynamic))? else {
+            return Err(Error::config(
+                "phase",
+                phase,
+                "lies between two phases, where live pictures show line integrals of one set of moving Gaussians only: choose \
+                 a whole phase, or exact quality",
+            ));
+        };
+        if quantity.component.has_static() {
+            let behind = self.baked.render(rays, size.0, size.1, 0, of(Component::Static))?;
+            image.iter_mut().zip(&behind).for_each(|(sum, behind)| *sum += behind);
+        }
+        Ok(image)
+    }
+
+    fn follow_and_refresh(
+        &self,
+        (step, refresh): (u32, Refresh),
+        phase: f64,
+        quantity: Quantity,
+    ) -> Result<Vec<Commands>> {
+        let last = self.freshness().volumes.len() as u32 - 2;
+        if !(0.0..f64::from(last + 1)).contains(&phase) {
+            return Err(Error::config("phase", phase, format!("is out of range: phases go from 0 to {last}")));
+        }
+        let between = phase.fract() != 0.0;
+        let drawn = quantity.projection == Projection::Drr && self.baked.renderer().gaussians_move();
+        let component = if between && drawn { Component::Static } else { quantity.component };
+        self.follow_gaussians()?;
+        if between && drawn && !quantity.component.has_static() {
+            return Ok(Vec::new());
+        }
+        self.refresh(step, refresh, phase as u32, Quantity { component, ..quantity })
+    }
+
+    fn alone(&self) -> MutexGuard<'_, ()> {
+        self.drawing.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn freshness(&self) -> MutexGuard<'_, Freshness> {
+        self.freshness.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Volumes that a picture shows.
+    fn shown_volumes(&self, phase: u32, quantity: Quantity) -> Vec<usize> {
+        let component = quantity.component;
+        let dynamic = component.has_dynamic() && !self.baked.renderer().draws_gaussians(quantity);
+        let slots = [(component.has_static(), 0), (dynamic, 1 + phase as usize)];
+        slots.into_iter().filter(|(shown, _)| *shown).map(|(_, slot)| slot).collect()
+    }
+
+    /// Iteration of the oldest part that a picture shows which was just drawn at `step`.
+    pub fn shown_step(&self, step: u32, phase: f64, quantity: Quantity) -> u32 {
+        let freshness = self.freshness();
+        let volumes = self.shown_volumes(phase as u32, quantity).into_iter();
+        volumes.filter_map(|slot| freshness.volumes[slot].baked_at).fold(step, u32::min)
+    }
+
+    fn refresh(&self, step: u32, refresh: Refresh, phase: u32, quantity: Quantity) -> Result<Vec<Commands>> {
         let mut under_way = Vec::new();
         self.baked.renderer().check_phase(phase)?;
-        let component = quantity.component;
-        let static_field = (component.has_static(), Component::Static, 0);
-        let baked = component.has_dynamic() && !self.baked.renderer().draws_gaussians(quantity);
-        let dynamic_field = (baked, Component::Dynamic, 1 + phase as usize);
-        for (wanted, field, slot) in [static_field, dynamic_field] {
-            let old = || self.baked_at[slot] != step && Instant::now() >= self.rest_until;
-            if wanted && (!self.baked.has(field, phase) || old()) {
-                let begin = Instant::now();
+        for slot in self.shown_volumes(phase, quantity) {
+            let begin = Instant::now();
+            let bakes = {
+                let mut freshness = self.freshness();
+                let rests = refresh == Refresh::Beside || begin < freshness.rest_until;
+                let age = &mut freshness.volumes[slot];
+                age.shown = Some(begin);
+                age.baked_at.is_none_or(|baked_at| baked_at != step && !rests)
+            };
+            if bakes {
+                let (field, phase) = volume(slot);
                 under_way.extend(self.follow(step)?);
                 under_way.extend(self.baked.bake(field, phase)?);
-                self.baked_at[slot] = step;
-                self.rest_until = Instant::now() + begin.elapsed() * REST;
+                self.note_baked(slot, step, begin);
             }
         }
         Ok(under_way)
+    }
+
+    fn note_baked(&self, slot: usize, step: u32, begin: Instant) {
+        let mut freshness = self.freshness();
+        freshness.volumes[slot].baked_at = Some(step);
+        freshness.rest_until = Instant::now() + begin.elapsed() * REST;
+    }
+
+    /// Bakes the volumes anew that pictures showed lately and that are older than `step`, the source's present iteration, while
+    /// pictures may be drawn in other threads; refreshing takes at most a fifth of the time.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn refresh_beside(&self, step: u32) -> Result<()> {
+        let stale = {
+            let freshness = self.freshness();
+            let lately = |age: &VolumeAge| age.shown.is_some_and(|shown| shown.elapsed() < SHOWN_LATELY);
+            let stale = |age: &VolumeAge| age.baked_at.is_some_and(|baked_at| baked_at != step) && lately(age);
+            let rests = Instant::now() < freshness.rest_until;
+            // The oldest first, so that each has its turn.
+            let of_age = |slot: &usize| freshness.volumes[*slot].baked_at;
+            (0..freshness.volumes.len()).filter(|slot| !rests && stale(&freshness.volumes[*slot])).min_by_key(of_age)
+        };
+        stale.map_or(Ok(()), |slot| self.bake_beside(slot, step))
+    }
+
+    /// Bakes, at `step`, the volumes that pictures of `earlier` showed, before this takes its place.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn bake_like(&self, earlier: &Live, step: u32) -> Result<()> {
+        let before = earlier.freshness().volumes.clone();
+        for (slot, age) in before.iter().enumerate().take(self.freshness().volumes.len()) {
+            if age.shown.is_some_and(|shown| shown.elapsed() < SHOWN_LATELY) {
+                self.bake_beside(slot, step)?;
+                self.freshness().volumes[slot].shown = age.shown;
+            }
+        }
+        Ok(())
+    }
+
+    fn bake_beside(&self, slot: usize, step: u32) -> Result<()> {
+        let (begin, (field, phase)) = (Instant::now(), volume(slot));
+        let followed = if slot == 0 { self.follow_params(step)? } else { self.follow(step)? };
+        let cells = self.baked.cells(field, phase)?;
+        drop(followed);
+        {
+            let _alone = self.alone();
+            drop(self.baked.fill(field, phase, &cells)?);
+        }
+        self.note_baked(slot, step, begin);
+        Ok(())
     }
 
     /// Renders through the fields themselves, as they are at the source's present iteration.
     ///
     /// # Errors
     /// As [`Renderer::render`].
-    pub fn render_fields(&self, step: u32, rays: &ViewRays, size: (usize, usize), phase: u32) -> Result<Rendering> {
+    pub fn render_fields(&self, step: u32, rays: &ViewRays, size: (usize, usize), phase: f64) -> Result<Rendering> {
         let _under_way = self.follow(step)?;
-        self.baked.renderer().render(rays, size.0, size.1, phase)
+        self.baked.renderer().render_at(rays, size.0, size.1, phase)
     }
 
     /// Returns the renderer, brought up to the source's present iteration.
@@ -158,6 +317,10 @@ impl Live {
 
     fn follow(&self, step: u32) -> Result<Option<Commands>> {
         self.follow_gaussians()?;
+        self.follow_params(step)
+    }
+
+    fn follow_params(&self, step: u32) -> Result<Option<Commands>> {
         let Some(params) = &self.params else { return Ok(None) };
         self.baked.renderer().follow(params, self.config.schedule(step)).map(Some)
     }

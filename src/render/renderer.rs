@@ -8,7 +8,7 @@ use crate::gaussians::pictures::Pictures;
 use crate::geometry::ViewRays;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
-use crate::gpu::pace::SubmitPace;
+use crate::gpu::pace::{LONGEST_SLICE_S, SubmitPace};
 use crate::gpu::record::{Commands, MAX_GROUPS, Recording};
 use crate::kernels::layout::{DeviceState, Pose, RayOut, Schedule, Setup, View};
 use crate::kernels::push;
@@ -28,14 +28,25 @@ use crate::scan::gating::BeatTime;
 use bytemuck::Zeroable;
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 /// Pixels rendered by one submit, which has a workgroup for each.
 pub(super) const RAYS_PER_SUBMIT: u32 = MAX_GROUPS;
 
+/// Cells of a volume sampled by one submit: 16 MiB on their way to the host.
+pub(super) const CELLS_PER_SUBMIT: u32 = 1 << 22;
+
 /// Pixels rendered by the first submits, whose times tell how many the next may have.
 const FIRST_RAYS: u32 = 4096;
+
+/// Pixels of the first slices of long work, whose times tell how many the next may have.
+const FIRST_SLICE_RAYS: u32 = 512;
+/// Cells of a volume in the first slices of long work.
+const FIRST_SLICE_CELLS: u32 = 1 << 14;
+
+/// Function that is called between the slices of long work: it may wait, or end the work by an error.
+pub type Interlude = Arc<dyn Fn() -> Result<()> + Send + Sync>;
 
 /// Values seen by every pixel of a view; all lists are rows first, attenuation per world unit.
 #[derive(Debug, Clone, Default)]
@@ -101,6 +112,10 @@ pub struct Renderer {
     pub(super) field: Option<Box<dyn FieldDrawing>>,
     /// Submit pace per kind of rendering, without and with the static field, of integrals and of maxima; their costs differ.
     paces: [SubmitPace; 4],
+    /// Submit pace of volumes, without and with the static field; none where a submit may take all cells that have room.
+    pub(super) volume_paces: Option<[SubmitPace; 2]>,
+    /// Called between slices.
+    interlude: Option<Interlude>,
     drawn: Mutex<Drawn>,
 }
 
@@ -160,10 +175,33 @@ impl Renderer {
             pictures,
             field,
             paces,
+            volume_paces: None,
+            interlude: None,
             drawn,
         };
         renderer.set_params(model)?;
         Ok(renderer)
+    }
+
+    /// Divides its work into slices of bounded device time, also on devices without a watchdog, with `interlude` before each: other
+    /// work, such as live pictures, passes between them. Results are the same, bit by bit.
+    #[must_use]
+    pub fn in_slices(self, interlude: Interlude) -> Renderer {
+        let longest_s = self.kernels.tuning.longest_submit_s.unwrap_or(LONGEST_SLICE_S).min(LONGEST_SLICE_S);
+        let pace = |first, max| SubmitPace::new(Some(longest_s), first, max).giving_way_to(self.gpu.looks());
+        let paces = std::array::from_fn(|_| pace(FIRST_SLICE_RAYS, RAYS_PER_SUBMIT));
+        let volume_paces = Some(std::array::from_fn(|_| pace(FIRST_SLICE_CELLS, CELLS_PER_SUBMIT)));
+        Renderer { paces, volume_paces, interlude: Some(interlude), ..self }
+    }
+
+    /// Lets other work pass before a slice.
+    pub(super) fn pause(&self) -> Result<()> {
+        self.interlude.as_ref().map_or(Ok(()), |interlude| interlude())
+    }
+
+    /// Acquires the buffers in which rays and samples of one view or one volume have their place on the device.
+    pub(super) fn alone(&self) -> MutexGuard<'_, Drawn> {
+        self.drawn.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Replaces parameters, window and Gaussians by those of `model`, which must have the same parameters.
@@ -195,7 +233,8 @@ impl Renderer {
         match (&self.blobs, &self.pictures) {
             (Some(blobs), Some(pictures)) => {
                 pictures.replace(field);
-                blobs.replace(field)
+                blobs.replace(field);
+                Ok(())
             }
             _ => Err(Error::Internal("the dynamic field of this model is a network".into())),
         }
@@ -215,11 +254,12 @@ impl Renderer {
 
     /// Takes the parameters in `params`, of a run in training, as they are after everything submitted so far; returns
     /// at once. `schedule` is that of the run's present iteration. Keep the result until what is rendered next is done:
-    /// dropping it waits. No rendering may be under way.
+    /// dropping it waits.
     ///
     /// # Errors
     /// [`Error::Internal`] when the buffer has another size; device errors.
     pub fn follow(&self, params: &Buffer, schedule: Schedule) -> Result<Commands> {
+        let _alone = self.alone();
         let mut recording = Recording::new(&self.gpu, "follow")?;
         recording.copy(params, 0, &self.buffers.params, 0, self.param_map.len as u64 * 4)?;
         self.buffers.schedule.write(&[schedule])?;
@@ -308,6 +348,27 @@ impl Renderer {
         let static_field = self.blobs.is_none() || quantity.component.has_static();
         let parts = RenderedParts { static_field, maxima: quantity.projection == Projection::Mip };
         Ok(self.render_parts(rays, (width, height), phase, parts)?.show(quantity))
+    }
+
+    /// Renders what [`Renderer::show`] does at a time counted in phases, which may lie between two; none unless it shows line
+    /// integrals of one set of Gaussians that moves.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn show_between(
+        &self,
+        rays: &ViewRays,
+        size: (usize, usize),
+        phase: f64,
+        quantity: Quantity,
+    ) -> Result<Option<Vec<f32>>> {
+        let moves = self.blobs.as_ref().is_some_and(Blobs::move_between_phases);
+        match (&self.pictures, quantity.component, quantity.projection) {
+            (Some(pictures), Component::Dynamic, Projection::Drr) if moves => {
+                pictures.draw_at(rays, size, phase).map(Some)
+            }
+            _ => Ok(None),
+        }
     }
 
     /// Draws line integrals of Gaussians as [`Renderer::show`] does, into a buffer on the device, either in front of its
@@ -424,10 +485,10 @@ impl Renderer {
     ) -> Result<Rendering> {
         let (pixels, image_width) = ((width * height) as u32, width as u32);
         let pace = &self.paces[usize::from(parts.static_field) + 2 * usize::from(parts.maxima)];
-        // One view at a time: its rays and what they see have one place on the device.
-        let mut drawn = self.drawn.lock().unwrap_or_else(PoisonError::into_inner);
         let (mut out, mut first_pixel) = (Rendering::default(), 0);
         while first_pixel < pixels {
+            self.pause()?;
+            let mut drawn = self.alone();
             let n_rays = rays_at_once(pace, image_width).min(pixels - first_pixel);
             let begin = Instant::now();
             let strip = drawn.strip(self, Strip { n_rays, image_width, parts }, taken, blobs)?;
@@ -447,7 +508,6 @@ impl Renderer {
             out.extend(&seen);
             first_pixel += n_rays;
         }
-        drop(drawn);
         if let Some(pictures) = self.pictures.as_ref().filter(|pictures| pictures.are_blended()) {
             out.dynamic_integral = pictures.draw(rays, (width, height), taken.phase)?;
             out.is_blended = true;
@@ -533,7 +593,7 @@ const MAX_RECORDED: usize = 16;
 
 /// Strips drawn so far.
 #[derive(Default)]
-struct Drawn {
+pub(super) struct Drawn {
     /// Strips of fields that are networks, whose commands are the same at all times.
     recorded: HashMap<Strip, RecordedStrip>,
     /// Last strip of any other field.

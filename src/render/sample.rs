@@ -13,12 +13,10 @@ use crate::network::forward::{ForwardBuffers, PoseBuffers};
 use crate::network::pass::Pass;
 use crate::network::static_network::static_setup;
 use crate::render::grid::{Grid, PatientGrid};
-use crate::render::renderer::{RAYS_PER_SUBMIT, Renderer, pose};
+use crate::render::renderer::{CELLS_PER_SUBMIT, RAYS_PER_SUBMIT, Renderer, pose};
 use crate::scan::gating::BeatTime;
 use glam::DVec3;
-
-/// Cells sampled by one submit: 16 MiB on their way to the host.
-const CELLS_PER_SUBMIT: u32 = 1 << 22;
+use std::time::Instant;
 
 impl Renderer {
     /// Attenuation per world unit at the points of a grid, of a component at a phase; each field is zero outside its box
@@ -66,14 +64,19 @@ impl Renderer {
             setup = static_setup(&setup);
         }
         let rows = ny * nz;
-        let rows_at_once = RAYS_PER_SUBMIT.min((CELLS_PER_SUBMIT / nx).max(1)).min(rows);
-        let bytes = u64::from(rows_at_once) * u64::from(nx) * 4;
+        let most_rows = RAYS_PER_SUBMIT.min((CELLS_PER_SUBMIT / nx).max(1)).min(rows);
+        let pace = self.volume_paces.as_ref().map(|paces| &paces[usize::from(field == Component::Static)]);
+        let bytes = u64::from(most_rows) * u64::from(nx) * 4;
         let cells = self.gpu.buffer("volume", bytes, Memory::Device)?;
         let read = self.gpu.buffer("volume read-back", bytes, Memory::Readback)?;
         let mut out = vec![0f32; grid.len()];
-        for (i, out) in out.chunks_mut((rows_at_once * nx) as usize).enumerate() {
-            let first = i as u32 * rows_at_once;
-            let n = rows_at_once.min(rows - first);
+        let (mut first, mut left) = (0, &mut out[..]);
+        while first < rows {
+            self.pause()?;
+            let n = pace.map_or(most_rows, |pace| (pace.items() / nx).clamp(1, most_rows)).min(rows - first);
+            let (out, rest) = std::mem::take(&mut left).split_at_mut((n * nx) as usize);
+            let _alone = self.alone();
+            let begin = Instant::now();
             // One submit, the constants included: behind a run in training, each would wait its turn.
             let mut r = Recording::new(&self.gpu, "sample")?;
             let pose = pose(BeatTime::at_phase(phase), &setup, first);
@@ -107,6 +110,10 @@ impl Renderer {
             r.copy(&cells, 0, &read, 0, u64::from(n) * u64::from(nx) * 4)?;
             self.gpu.wait(r.finish()?.submit()?)?;
             read.read(out)?;
+            if let Some(pace) = pace {
+                pace.note(n * nx, begin.elapsed().as_secs_f64());
+            }
+            (first, left) = (first + n, rest);
         }
         Ok(out)
     }

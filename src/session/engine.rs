@@ -5,25 +5,31 @@ use crate::calibrate::correction::Calibration;
 use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
+use crate::gpu::pipeline::KeptPipelines;
 use crate::kernels::tuning::Tuning;
 use crate::methods;
 use crate::model::Model;
 use crate::model::scene::Scene;
 use crate::plan::Plan;
-use crate::render::live::{Live, Source};
-use crate::session::inbox::Inbox;
+use crate::render::live::{Live, Refresh, Source};
+use crate::render::quantity::Quantity;
+use crate::render::renderer::Interlude;
+use crate::session::inbox::{Inbox, Taken};
+use crate::session::long_work::{LongViewer, LongWork};
 use crate::session::progress::{Observer, Progress, State};
 use crate::train::trainer::Trainer;
 use crate::train::training::Training;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::ThreadId;
 use std::time::{Duration, Instant};
 
 /// Pause after taking in new frames, as a multiple of the time that took.
 const SETTLE: u32 = 4;
-/// Time without a new frame that ends the pause early; so does the time that the last intake took.
+/// Shortest time without a new frame that ends the pause early.
 const QUIET: Duration = Duration::from_millis(300);
+/// Number of intervals between the last frames without a new one after which a run counts as over.
+const MISSED_FRAMES: u32 = 3;
 /// Interval at which training looks again while others wait for the engine.
 const GIVE_WAY: Duration = Duration::from_micros(200);
 
@@ -35,6 +41,8 @@ pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 pub(super) struct Shared {
     pub(super) gpu: Option<Gpu>,
     pub(super) tuning: Option<Tuning>,
+    /// Fits and renderers follow one another, and need the same pipelines.
+    pub(super) _pipelines: Option<KeptPipelines>,
     pub(super) inbox: Mutex<Inbox>,
     /// Rises with every change of the inbox.
     pub(super) version: AtomicU64,
@@ -46,7 +54,16 @@ pub(super) struct Shared {
     pub(super) calibration: Mutex<Option<Calibration>>,
     /// Iterations handed to the device.
     pub(super) step: AtomicU32,
-    pub(super) viewer: Mutex<Option<(u64, Live)>>,
+    pub(super) viewer: Mutex<Option<Viewer>>,
+    /// The last live picture.
+    pub(super) drawn: Mutex<Option<Drawn>>,
+    /// Renderer of long work, for which live pictures do not wait.
+    pub(super) fields: Mutex<Option<LongViewer>>,
+    pub(super) long_work: LongWork,
+    /// Whether a thread trains at this moment, which then keeps up to date what live pictures show.
+    pub(super) renews: AtomicBool,
+    /// Frames that training took in last.
+    pub(super) taken: Mutex<Taken>,
     pub(super) control: Mutex<Control>,
     pub(super) changed: Condvar,
     pub(super) stop: AtomicBool,
@@ -71,7 +88,7 @@ pub(super) struct Engine {
 pub(super) struct Settling {
     /// End of the pause.
     until: Instant,
-    /// Time without a new frame that ends the pause early.
+    /// Longest time without a new frame that the pause waits for.
     quiet: Duration,
 }
 
@@ -80,6 +97,27 @@ pub(super) struct Settling {
 pub(super) struct Published {
     pub(super) generation: u64,
     pub(super) source: Option<Source>,
+    /// Number of frames that the field was fitted to.
+    pub(super) frames: u32,
+}
+
+/// Renderer of live pictures.
+#[derive(Clone)]
+pub(super) struct Viewer {
+    /// Generation of the source that it shows.
+    generation: u64,
+    /// Number of frames that its field was fitted to.
+    frames: u32,
+    live: Arc<Live>,
+}
+
+/// Field that a live picture showed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Drawn {
+    /// Number of frames that it was fitted to; 0 for a checkpoint that was loaded.
+    pub frames: u32,
+    /// Iterations of the oldest part that the picture shows.
+    pub step: u32,
 }
 
 /// State of training, for those who wait for it.
@@ -89,6 +127,10 @@ pub(super) struct Control {
     pub(super) worker: Option<ThreadId>,
     /// When frames or R-peaks came last.
     pub(super) news: Instant,
+    /// Time between the last two.
+    pub(super) news_apart: Duration,
+    /// Version of the inbox at which training in the background found too few frames.
+    pub(super) waits_at: u64,
 }
 
 pub(super) fn nothing_yet() -> Error {
@@ -130,45 +172,141 @@ impl Shared {
         engine
     }
 
-    pub(super) fn publish(&self, source: Source) {
-        let mut published = lock(&self.published);
-        published.generation += 1;
-        published.source = Some(source);
+    /// Shows another source from now on, whose field was fitted to `frames` frames; none for as many as that shown so far.
+    pub(super) fn publish(&self, source: Source, frames: Option<u32>) {
+        {
+            let mut published = lock(&self.published);
+            published.generation += 1;
+            published.source = Some(source);
+            published.frames = frames.unwrap_or(published.frames);
+        }
+        // Long work under way keeps what it began with; nothing else needs the earlier source.
+        if let Ok(mut fields) = self.fields.try_lock() {
+            *fields = None;
+        }
     }
 
-    pub(super) fn with_viewer<T>(&self, draw: impl FnOnce(&mut Live, u32) -> Result<T>) -> Result<T> {
-        let (gpu, tuning) = self.device()?;
-        gpu.looks().note();
-        let mut viewer = lock(&self.viewer);
+    fn source(&self) -> (u64, u32, Option<Source>) {
+        let published = lock(&self.published);
+        (published.generation, published.frames, published.source.clone())
+    }
+
+    /// Draws a live picture. It waits for earlier pictures and for submits under way, and for nothing else.
+    pub(super) fn with_viewer<T>(
+        &self,
+        phase: f64,
+        quantity: Quantity,
+        draw: impl FnOnce(&Live, (u32, Refresh)) -> Result<T>,
+    ) -> Result<T> {
+        let (gpu, _) = self.device()?;
+        let _drawn = gpu.looks().begin();
         let step = self.step.load(Ordering::Acquire);
-        let (generation, source) = {
-            let published = lock(&self.published);
-            let current = viewer.as_ref().is_some_and(|(of, _)| *of == published.generation);
-            (published.generation, if current { None } else { published.source.clone() })
-        };
-        if let Some(source) = source {
-            // The memory of the old viewer must be free first.
-            *viewer = None;
-            *viewer = Some((generation, Live::new(gpu, &source, tuning.clone())?));
+        let refresh = if self.renews.load(Ordering::Acquire) { Refresh::Beside } else { Refresh::Now };
+        let Viewer { live, frames, .. } = self.viewer(refresh)?;
+        let picture = draw(&live, (step, refresh))?;
+        *lock(&self.drawn) = Some(Drawn { frames, step: live.shown_step(step, phase, quantity) });
+        Ok(picture)
+    }
+
+    /// Returns what draws live pictures. A new source is prepared here, unless the training thread does so.
+    fn viewer(&self, refresh: Refresh) -> Result<Viewer> {
+        let mut viewer = lock(&self.viewer);
+        let (generation, frames, source) = self.source();
+        if let Some(viewer) = &mut *viewer {
+            if viewer.generation == generation {
+                viewer.frames = frames;
+                return Ok(viewer.clone());
+            }
+            if refresh == Refresh::Beside {
+                return Ok(viewer.clone());
+            }
         }
-        match &mut *viewer {
-            Some((_, live)) => draw(live, step),
-            None => Err(nothing_yet()),
+        // The memory of the old viewer must be free first.
+        *viewer = None;
+        let live = Arc::new(self.live(&source.ok_or_else(nothing_yet)?)?);
+        Ok(viewer.insert(Viewer { generation, frames, live }).clone())
+    }
+
+    fn live(&self, source: &Source) -> Result<Live> {
+        let (gpu, tuning) = self.device()?;
+        let looks = gpu.looks().clone();
+        let interlude: Interlude = Arc::new(move || {
+            looks.give_way();
+            Ok(())
+        });
+        Live::new(gpu, source, tuning.clone(), Some(interlude))
+    }
+
+    /// Keeps up to date what live pictures show, beside them, in the thread that trains. The earlier source is drawn
+    /// until all that pictures needed lately has been prepared from the new one.
+    pub(super) fn renew_viewer(&self) {
+        let Some(viewer) = lock(&self.viewer).clone() else { return };
+        if self.try_renew(&viewer).is_err() {
+            // The next picture prepares anew, with the memory of the old viewer, and tells its error.
+            *lock(&self.viewer) = None;
         }
     }
 
-    /// Brings the trainer up to the frames there are.
-    pub(super) fn take_in_frames(&self, engine: &mut Engine) -> Result<()> {
+    fn try_renew(&self, viewer: &Viewer) -> Result<()> {
+        let (gpu, _) = self.device()?;
+        let step = self.step.load(Ordering::Acquire);
+        let (generation, frames, source) = self.source();
+        if viewer.generation == generation {
+            return viewer.live.refresh_beside(step);
+        }
+        let prepared = match source.filter(|_| gpu.looks().are_recent()) {
+            Some(source) => {
+                let live = Arc::new(self.live(&source)?);
+                live.bake_like(&viewer.live, step)?;
+                Some(Viewer { generation, frames, live })
+            }
+            // Nobody looks: the memory is free for training.
+            None => None,
+        };
+        *lock(&self.viewer) = prepared;
+        Ok(())
+    }
+
+    /// Does long work on the fields as they are at its beginning, in slices that live pictures pass. Long work is done one after
+    /// the other.
+    pub(super) fn with_fields<T>(&self, work: impl FnOnce(&Live, u32) -> Result<T>) -> Result<T> {
+        let (gpu, tuning) = self.device()?;
+        let begun = self.long_work.begin();
+        let mut fields = lock(&self.fields);
+        let step = self.step.load(Ordering::Acquire);
+        let (generation, _, source) = self.source();
+        let source = source.ok_or_else(nothing_yet)?;
+        let viewer = match fields.take() {
+            Some(viewer) if viewer.generation == generation => viewer,
+            earlier => {
+                // The memory of the earlier one must be free first.
+                drop(earlier);
+                let call = Arc::new(Mutex::new(begun.clone()));
+                let live = Live::new(gpu, &source, tuning.clone(), Some(LongWork::interlude(gpu, &call)))?;
+                LongViewer { generation, live, call }
+            }
+        };
+        *lock(&viewer.call) = begun;
+        work(&fields.insert(viewer).live, step)
+    }
+
+    /// Brings the trainer up to the frames there are; `begin` is called when there are enough new ones.
+    pub(super) fn take_in_frames(&self, engine: &mut Engine, begin: impl FnOnce()) -> Result<()> {
         let (gpu, tuning) = self.device()?;
         let version = self.version.load(Ordering::Acquire);
         if engine.version == version && engine.training.is_some() {
             return Ok(());
         }
-        let begin = Instant::now();
-        let (dataset, config) = {
+        let started = Instant::now();
+        let ((dataset, taken), config, left_out) = {
             let inbox = lock(&self.inbox);
-            (inbox.training_dataset()?, inbox.options.config.clone())
+            let left_out = inbox.leaves_out().then(|| inbox.why_left_out());
+            (inbox.training_dataset()?, inbox.options.config.clone(), left_out)
         };
+        begin();
+        if let Some(why) = left_out {
+            tracing::warn!("some frames are not used: {why}");
+        }
         let mut tuning = tuning.clone();
         if gpu.info().is_cpu() {
             // Views wait for what was submitted before them.
@@ -208,10 +346,12 @@ impl Shared {
         *lock(&self.calibration) = Some(calibration);
         engine.frames = dataset.training().len() as u32;
         engine.version = version;
-        let took = begin.elapsed();
+        *lock(&self.taken) = taken;
+        let took = started.elapsed();
         engine.settling = Some(Settling { until: Instant::now() + took * SETTLE, quiet: took.max(QUIET) });
         self.step.store(trainer.step(), Ordering::Release);
-        self.publish(Source { outline: trainer.outline(), feed: trainer.feed() });
+        let shown = (!trainer.shows_earlier()).then_some(engine.frames);
+        self.publish(Source { outline: trainer.outline(), feed: trainer.feed() }, shown);
         engine.training = Some(Training::new(trainer));
         Ok(())
     }
@@ -235,6 +375,9 @@ impl Shared {
             tracing::warn!("{large}");
         }
         self.step.store(trainer.submitted(), Ordering::Release);
+        if !trainer.shows_earlier() {
+            lock(&self.published).frames = frames;
+        }
         let config = &trainer.plan().config;
         let every = config.train.checkpoint_every;
         let progress = progress.last().map(|p| Progress {
@@ -273,7 +416,8 @@ impl Shared {
 
     fn has_settled(&self, engine: &Engine) -> bool {
         let Some(Settling { until, quiet }) = engine.settling else { return true };
-        Instant::now() >= until || lock(&self.control).news.elapsed() >= quiet
+        let control = lock(&self.control);
+        Instant::now() >= until || control.news.elapsed() >= quiet_time(control.news_apart, quiet)
     }
 
     pub(super) fn set_state(&self, state: State) {
@@ -291,6 +435,12 @@ impl Shared {
 
     /// Runs training in the background.
     pub(super) fn work(&self, observe: &mut Observer<'_>) -> Result<State> {
+        let ended = self.work_until_end(observe);
+        self.renews.store(false, Ordering::Release);
+        ended
+    }
+
+    fn work_until_end(&self, observe: &mut Observer<'_>) -> Result<State> {
         lock(&self.engine).start_clock();
         loop {
             if self.stop.load(Ordering::Acquire) {
@@ -299,24 +449,28 @@ impl Shared {
             }
             if self.pause.load(Ordering::Acquire) {
                 self.drain(&mut lock(&self.engine))?;
+                self.renews.store(false, Ordering::Release);
                 self.set_state(State::Paused);
                 self.rest(Duration::from_secs(1), || self.pause.load(Ordering::Acquire));
                 lock(&self.engine).start_clock();
                 continue;
             }
+            self.renews.store(true, Ordering::Release);
+            self.renew_viewer();
             while self.visitors.load(Ordering::Acquire) > 0 {
                 std::thread::sleep(GIVE_WAY);
             }
             let mut engine = lock(&self.engine);
             let version = self.version.load(Ordering::Acquire);
             if engine.version != version && self.has_settled(&engine) {
-                match self.take_in_frames(&mut engine) {
+                match self.take_in_frames(&mut engine, || self.set_state(State::Running)) {
                     Ok(()) => (),
-                    Err(Error::NotReady(why)) if engine.training.is_none() => {
+                    Err(Error::NotReady(why)) => {
+                        // Frames may have been removed, or have other geometry: the field so far is kept.
+                        self.drain(&mut engine)?;
                         drop(engine);
                         tracing::info!("waiting for frames: {why}");
-                        self.set_state(State::Waiting);
-                        self.rest(Duration::from_secs(60), || self.version.load(Ordering::Acquire) == version);
+                        self.wait_for_frames(version);
                         continue;
                     }
                     Err(error) => return Err(error),
@@ -325,7 +479,8 @@ impl Shared {
             self.set_state(State::Running);
             let length = engine.length();
             let progress = self.advance(&mut engine, length)?;
-            let done = engine.step() >= length && engine.version == version;
+            let at_end = engine.step() >= length;
+            let done = at_end && engine.version == version;
             drop(engine);
             if progress.is_some_and(|p| !observe(&p)) {
                 self.drain(&mut lock(&self.engine))?;
@@ -334,7 +489,43 @@ impl Shared {
             if done {
                 return Ok(State::Finished);
             }
+            if at_end {
+                // More frames may follow those that came last.
+                self.rest(GIVE_WAY, || true);
+            }
         }
+    }
+
+    /// Waits until the frames are no longer those of `version`.
+    fn wait_for_frames(&self, version: u64) {
+        self.renews.store(false, Ordering::Release);
+        {
+            let mut control = lock(&self.control);
+            (control.state, control.waits_at) = (State::Waiting, version);
+        }
+        self.changed.notify_all();
+        self.rest(Duration::from_secs(60), || self.version.load(Ordering::Acquire) == version);
+    }
+
+    /// Tells whether training in the background has something to do: it trains, plans, or has not yet looked at the newest frames.
+    pub(super) fn is_busy(&self) -> bool {
+        let control = lock(&self.control);
+        has_work(control.state, control.waits_at, self.version.load(Ordering::Acquire))
+    }
+}
+
+/// Time without a new frame after which no other is expected soon, at most `longest`: a fit that begins without the last frames of a run is
+/// lost work.
+fn quiet_time(news_apart: Duration, longest: Duration) -> Duration {
+    QUIET.max(news_apart.saturating_mul(MISSED_FRAMES)).min(longest)
+}
+
+/// Tells whether training in the background has something to do at a version of the frames, when it found too few at `waits_at`.
+fn has_work(state: State, waits_at: u64, version: u64) -> bool {
+    match state {
+        State::Running => true,
+        State::Waiting => waits_at != version,
+        _ => false,
     }
 }
 
@@ -349,4 +540,24 @@ fn holds(model: &Model, new: &Scene) -> bool {
     let alike = |a: f64, b: f64| a / b < 2.0 && b / a < 2.0;
     let static_alike = old.static_gain == new.static_gain || alike(old.static_gain, new.static_gain);
     inside && static_alike && alike(old.dynamic_gain, new.dynamic_gain)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_is_over_when_some_frames_have_not_come() {
+        let ms = Duration::from_millis;
+        assert_eq!(quiet_time(ms(66), ms(2000)), QUIET, "fifteen frames per second");
+        assert_eq!(quiet_time(ms(500), ms(2000)), ms(1500), "frames that come slowly");
+        assert_eq!(quiet_time(ms(60_000), ms(2000)), ms(2000), "the first frame of another run");
+    }
+
+    #[test]
+    fn frames_that_were_not_looked_at_are_work() {
+        assert!(has_work(State::Running, 3, 3), "it plans or trains");
+        assert!(has_work(State::Waiting, 3, 4) && !has_work(State::Waiting, 4, 4));
+        assert!(!has_work(State::Finished, 3, 4) && !has_work(State::Paused, 3, 4), "nothing happens by itself");
+    }
 }

@@ -5,9 +5,10 @@ use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT};
 use crate::scan::canvas::onto_canvas;
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
-use crate::scan::frame_checks::{Complaint, check_phase, check_values, checked_view};
+use crate::scan::frame_checks::{Complaint, check_phase, check_values};
 use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
-use std::collections::BTreeMap;
+use crate::scan::same_view::{SAME_VIEW_PX, find_or_add};
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 /// Options of a session.
@@ -65,13 +66,51 @@ fn told(complaint: Complaint) -> Error {
     bad(&complaint.field, complaint.value, complaint.problem)
 }
 
+/// Use of a frame that was added.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FrameUse {
+    /// Training uses it when it next takes frames in, if there are enough of them.
+    Training,
+    /// It is kept for scores.
+    Validation,
+    /// Its phase is not known: its time is not covered by R-peaks.
+    NoPhase,
+    /// The training frames of its view show one phase only, so nothing in it is known to move.
+    OnePhase,
+}
+
+/// Properties that a session has found for a frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FrameStatus {
+    /// Use of the frame.
+    pub usage: FrameUse,
+    /// Time in the beat, where it is known.
+    pub beat_time: Option<BeatTime>,
+    /// View that it belongs to: frames of one size whose geometries agree within a tenth of a pixel have the same number.
+    pub view: usize,
+    /// Whether the reconstruction was trained with it, as it is now, since training last took frames in.
+    pub taken_in: bool,
+}
+
+/// A frame as it came.
+pub(super) struct Kept {
+    pub(super) frame: Frame,
+    pub(super) moment: FrameTime,
+    /// Rises with every change of the frame.
+    pub(super) change: u64,
+}
+
 /// Checked frames, and how they are to be used.
 pub(super) struct Inbox {
     pub(super) options: SessionOptions,
     pub(super) views: Vec<View>,
-    pub(super) frames: Vec<(Frame, FrameTime)>,
+    /// Frames in the order in which they were added; none where a frame was removed.
+    pub(super) frames: Vec<Option<Kept>>,
     pub(super) r_peaks: Option<RPeaks>,
 }
+
+/// Training frames of a session: index, phase, view and change of each.
+pub(super) type Taken = Vec<(usize, BeatTime, usize, u64)>;
 
 impl Inbox {
     pub(super) fn add(&mut self, new: NewFrame) -> Result<()> {
@@ -107,37 +146,95 @@ impl Inbox {
             after_phase: 0.0,
             heart_shift_mm: [0.0; 3],
         };
-        self.frames.push((frame, new.moment));
+        self.frames.push(Some(Kept { frame, moment: new.moment, change: 0 }));
         Ok(())
     }
 
-    /// States another geometry for a frame, counted from 0 as they were added.
-    pub(super) fn set_geometry(&mut self, index: usize, geometry: Geometry) -> Result<()> {
-        let size = self.views[self.frame(index)?.0.view].size;
-        self.frames[index].0.view = self.view(geometry, size)?;
+    /// Sets another geometry for a frame, or for all frames of its view.
+    pub(super) fn set_geometry(&mut self, index: usize, geometry: Geometry, whole_view: bool) -> Result<FrameUse> {
+        let before = self.frame(index)?.frame.view;
+        let view = self.view(geometry, self.views[before].size)?;
+        for (at, kept) in self.frames.iter_mut().enumerate() {
+            let Some(kept) = kept else { continue };
+            if at == index || whole_view && kept.frame.view == before {
+                (kept.frame.view, kept.change) = (view, kept.change + 1);
+            }
+        }
+        self.usage(index)
+    }
+
+    /// Removes a frame; the others keep their numbers.
+    pub(super) fn remove(&mut self, index: usize) -> Result<()> {
+        self.frame(index)?;
+        self.frames[index] = None;
         Ok(())
     }
 
     /// A frame, counted from 0 as they were added.
-    pub(super) fn frame(&self, index: usize) -> Result<&(Frame, FrameTime)> {
-        let none = || {
-            Error::config(
-                "frame",
-                index,
-                format!("there is no such frame: {} were added, and they are counted from 0", self.frames.len()),
-            )
-        };
-        self.frames.get(index).ok_or_else(none)
+    pub(super) fn frame(&self, index: usize) -> Result<&Kept> {
+        let wrong = |problem: String| Error::config("frame", index, problem);
+        match self.frames.get(index) {
+            Some(Some(kept)) => Ok(kept),
+            Some(None) => Err(wrong("was removed".into())),
+            None => Err(wrong(format!(
+                "there is no such frame: {} were added, and they are counted from 0",
+                self.frames.len()
+            ))),
+        }
     }
 
     /// Index of the view of images of `size` (columns, rows), which is new unless an earlier frame was taken from there.
     fn view(&mut self, geometry: Geometry, size: [usize; 2]) -> Result<usize> {
-        if let Some(known) = self.views.iter().position(|v| v.geometry == geometry && v.size == size) {
-            return Ok(known);
-        }
         let depth_before = self.options.depth_half_extent_mm / MM_PER_UNIT;
-        self.views.push(checked_view(geometry, size, depth_before).map_err(told)?);
-        Ok(self.views.len() - 1)
+        find_or_add(&mut self.views, geometry, size, depth_before).map_err(told)
+    }
+
+    /// Use of a frame.
+    pub(super) fn usage(&self, index: usize) -> Result<FrameUse> {
+        let kept = self.frame(index)?;
+        Ok(self.usage_of(kept, &self.known_phases()))
+    }
+
+    /// Properties of a frame; `taken` are the frames that training took in.
+    pub(super) fn status(&self, index: usize, taken: &Taken) -> Result<FrameStatus> {
+        let kept = self.frame(index)?;
+        let (beat_time, view) = (self.beat_time(kept.moment), kept.frame.view);
+        let as_now = |beat_time| (index, beat_time, view, kept.change);
+        Ok(FrameStatus {
+            usage: self.usage(index)?,
+            beat_time,
+            view,
+            taken_in: beat_time.is_some_and(|beat_time| taken.contains(&as_now(beat_time))),
+        })
+    }
+
+    /// Phases at which training frames show each view.
+    fn known_phases(&self) -> BTreeMap<usize, BTreeSet<u32>> {
+        let mut known: BTreeMap<usize, BTreeSet<u32>> = BTreeMap::new();
+        for kept in self.frames.iter().flatten().filter(|kept| kept.frame.split == Split::Train) {
+            if let Some(taken) = self.beat_time(kept.moment) {
+                known.entry(kept.frame.view).or_default().insert(taken.phase);
+            }
+        }
+        known
+    }
+
+    fn usage_of(&self, kept: &Kept, known_phases: &BTreeMap<usize, BTreeSet<u32>>) -> FrameUse {
+        let phases = known_phases.get(&kept.frame.view).map_or(0, BTreeSet::len);
+        if self.beat_time(kept.moment).is_none() {
+            FrameUse::NoPhase
+        } else if kept.frame.split == Split::Validation {
+            FrameUse::Validation
+        } else if self.is_temporal() && phases < 2 {
+            FrameUse::OnePhase
+        } else {
+            FrameUse::Training
+        }
+    }
+
+    /// Tells whether the dynamic field is found by what changes over the beat, so that a view needs two phases.
+    fn is_temporal(&self) -> bool {
+        self.options.config.loss.dynamic_target == DynamicTarget::Temporal
     }
 
     /// Returns the time in the beat of a moment, where that is known.
@@ -150,24 +247,20 @@ impl Inbox {
         }
     }
 
-    /// The frames whose phase is known and that `keep` wants.
-    pub(super) fn dataset(&self, keep: impl Fn(&Frame, &[Frame]) -> bool) -> Result<Dataset> {
-        let known: Vec<Frame> = self
-            .frames
-            .iter()
-            .filter_map(|(frame, moment)| {
-                let BeatTime { phase, after_phase } = self.beat_time(*moment)?;
-                Some(Frame { phase, after_phase, ..frame.clone() })
-            })
-            .collect();
-        let mut frames: Vec<Frame> = known.iter().filter(|f| keep(f, &known)).cloned().collect();
+    /// The frames that `keep` wants, among those whose phase is known.
+    fn dataset(&self, keep: impl Fn(FrameUse) -> bool) -> Result<(Dataset, Taken)> {
+        let known_phases = self.known_phases();
+        let (mut frames, mut taken) = (Vec::new(), Taken::new());
+        for (index, kept) in self.frames.iter().enumerate() {
+            let Some(kept) = kept.as_ref().filter(|kept| keep(self.usage_of(kept, &known_phases))) else { continue };
+            let Some(beat_time) = self.beat_time(kept.moment) else { continue };
+            let BeatTime { phase, after_phase } = beat_time;
+            frames.push(Frame { phase, after_phase, ..kept.frame.clone() });
+            taken.push((index, beat_time, kept.frame.view, kept.change));
+        }
         frames.sort_by_key(|f| f.split);
         let Some([width, height]) = onto_canvas(&self.views, &mut frames).map_err(told)? else {
-            let n = self.frames.len();
-            return Err(Error::NotReady(format!(
-                "none of {n} frames can be used: a frame needs a phase, or a time stamp and R-peaks, and its view \
-                 needs frames of two phases"
-            )));
+            return Err(Error::NotReady(format!("no frame can be used: {}", self.why_left_out())));
         };
         let half = self.options.depth_half_extent_mm / MM_PER_UNIT;
         let mut dataset = Dataset {
@@ -185,24 +278,54 @@ impl Inbox {
             notes: Vec::new(),
         };
         dataset.hide();
-        Ok(dataset)
+        Ok((dataset, taken))
+    }
+
+    /// All frames whose phase is known, for scores.
+    pub(super) fn scored_dataset(&self) -> Result<Dataset> {
+        self.dataset(|_| true).map(|(dataset, _)| dataset)
     }
 
     /// The training frames: with a temporal target, those of views seen at two phases or more.
-    pub(super) fn training_dataset(&self) -> Result<Dataset> {
-        let temporal = self.options.config.loss.dynamic_target == DynamicTarget::Temporal;
-        let dataset = self.dataset(|frame, known| {
-            let beats = |f: &&Frame| f.view == frame.view && f.split == Split::Train && f.phase != frame.phase;
-            frame.split == Split::Train && (!temporal || known.iter().any(|f| beats(&f)))
-        })?;
+    pub(super) fn training_dataset(&self) -> Result<(Dataset, Taken)> {
+        let (dataset, taken) = self.dataset(|usage| usage == FrameUse::Training)?;
         let views = dataset.training_views().len();
-        if temporal && views < 2 {
+        if self.is_temporal() && views < 2 {
             return Err(Error::NotReady(format!(
-                "{views} views have frames of two or more phases, and at least two such views are needed (if the C-arm \
-                 turns or the table moves, each frame is a view of its own: use the preset paper, which is trained on \
-                 whole images)"
+                "{views} view has frames of two or more phases, and at least two such views are needed; {}",
+                self.why_left_out()
             )));
         }
-        Ok(dataset)
+        Ok((dataset, taken))
+    }
+
+    /// Explains how many training frames are left out and why.
+    pub(super) fn why_left_out(&self) -> String {
+        let known_phases = self.known_phases();
+        let training = || self.frames.iter().flatten().filter(|kept| kept.frame.split == Split::Train);
+        let count = |usage| training().filter(|kept| self.usage_of(kept, &known_phases) == usage).count();
+        let mut reasons = Vec::new();
+        let (without_phase, alone) = (count(FrameUse::NoPhase), count(FrameUse::OnePhase));
+        if without_phase > 0 {
+            reasons.push(format!("{without_phase} have no phase, because R-peaks do not cover their times"));
+        }
+        if alone > 0 {
+            reasons.push(format!(
+                "{alone} belong to views of which training frames show one phase only (frames share a view while their \
+                 geometries agree within {SAME_VIEW_PX} pixels; if the C-arm turns or the table moves during a run, use \
+                 the preset paper, which is trained on whole images)"
+            ));
+        }
+        let all = training().count();
+        if reasons.is_empty() {
+            return format!("there are {all} training frames");
+        }
+        format!("of {all} training frames, {}", reasons.join(", and "))
+    }
+
+    /// Tells whether training leaves out frames whose phase is known.
+    pub(super) fn leaves_out(&self) -> bool {
+        let known_phases = self.known_phases();
+        self.frames.iter().flatten().any(|kept| self.usage_of(kept, &known_phases) == FrameUse::OnePhase)
     }
 }

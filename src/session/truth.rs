@@ -67,15 +67,17 @@ impl Session {
     /// from which the dynamic field counts as vessel.
     ///
     /// # Errors
-    /// [`Error::Data`] without such frames; as [`Session::render`] and [`Session::trees`].
+    /// [`Error::Data`] without such frames; [`Error::Interrupted`] after [`Session::cancel`]; as [`Session::render`] and
+    /// [`Session::trees`].
     pub fn evaluate(&self, threshold_per_mm: Option<f64>) -> Result<Evaluation> {
-        let dataset = lock(&self.shared.inbox).dataset(|_, _| true)?;
+        let call = self.shared.long_work.begin();
+        let dataset = lock(&self.shared.inbox).scored_dataset()?;
         let frames: Vec<_> = dataset.validation().iter().collect();
         let threshold = threshold_per_mm.map(|t| t * MM_PER_UNIT);
         let volumes = lock(&self.known).volumes.clone();
-        let mut evaluation = self.shared.with_viewer(|live, step| {
+        let mut evaluation = self.shared.with_fields(|live, step| {
             let renderer = live.renderer(step)?;
-            let mut evaluation = evaluate(renderer, &dataset, &frames, step, threshold, |_| Ok(()))?;
+            let mut evaluation = evaluate(renderer, &dataset, &frames, step, threshold, |_| call.check())?;
             let threshold_per_mm = evaluation.threshold.dynamic_per_mm;
             evaluation.volume = score_known(renderer, live.scene(), &volumes, threshold_per_mm, pixel_mm(&dataset))?;
             evaluation.warnings.extend(moving_field_warning(renderer, &dataset)?);
@@ -84,7 +86,7 @@ impl Session {
         let lines = lock(&self.known).trees.clone();
         if !lines.is_empty() {
             // What `tree` finds by itself: its threshold is not that of the images.
-            let mut beat = self.trees(threshold_per_mm, None)?;
+            let mut beat = self.trees_during(&call, threshold_per_mm, None)?;
             beat.phases.retain(|tree| lines.contains_key(&tree.phase));
             let at = |moment: f64| between(&lines, BeatTime::of(moment, dataset.n_phases), dataset.n_phases);
             evaluation.tree = Some(trees::score(&beat, &dataset, None, None, at)?);

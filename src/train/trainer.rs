@@ -219,6 +219,11 @@ impl Trainer {
         self.fit.preparation()
     }
 
+    /// Tells whether the field of earlier data is shown, until the fit has a better one.
+    pub fn shows_earlier(&self) -> bool {
+        self.fit.shows_earlier()
+    }
+
     /// Returns the numbers of the field, for those who draw it.
     pub fn feed(&self) -> FieldFeed {
         self.fit.feed()

@@ -7,6 +7,7 @@ mod c_scene;
 mod root;
 
 mod adoption;
+mod frames;
 mod life;
 mod misuse;
 mod random;

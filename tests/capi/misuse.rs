@@ -231,10 +231,19 @@ fn reconstructions(b: &Bench) {
     });
     let set = |times: *const f64, n| unsafe { nertca_reconstruction_set_r_peaks(b.bare, times, n) };
     b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "times_s", set(null(), 2));
+    b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "at least two are needed", set(times.as_ptr(), 0));
     b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "count", set(times.as_ptr(), usize::MAX));
     b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "at least two are needed", set(times.as_ptr(), 1));
     b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "must increase", set([1.0, 0.5].as_ptr(), 2));
     b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "not a time", set([1.0, f64::INFINITY].as_ptr(), 2));
+    let phase_of = "nertca_reconstruction_beat_phase";
+    let mut phase = 0.0;
+    let ask = |h, time_s, phase| unsafe { nertca_reconstruction_beat_phase(h, time_s, phase) };
+    b.refuses(phase_of, NERTCA_ERROR_ARGUMENT, "phase: is null", ask(b.bare, 0.0, null_mut()));
+    b.refuses(phase_of, NERTCA_ERROR_ARGUMENT, "time_s", ask(b.bare, f64::NAN, &mut phase));
+    b.refuses(phase_of, NERTCA_ERROR_NOT_READY, "do not cover", ask(b.bare, 1.0, &mut phase));
+    b.handles(phase_of, stale(b), b.context.cast(), |h| ask(h, 1.0, &mut 0.0));
+    b.handles("nertca_reconstruction_cancel", stale(b), b.context.cast(), |h| nertca_reconstruction_cancel(h));
     let progress = "nertca_reconstruction_progress";
     let mut room: nertca_progress = zeroed();
     b.refuses(progress, NERTCA_ERROR_ARGUMENT, "nertca_progress.size", unsafe {
@@ -263,6 +272,39 @@ fn calibration(b: &Bench) {
         nertca_reconstruction_set_geometry(b.bare, 0, &geometry(0))
     });
     b.handles(set, stale(b), b.context.cast(), |h| unsafe { nertca_reconstruction_set_geometry(h, 0, &geometry(0)) });
+    let set = "nertca_reconstruction_set_view_geometry";
+    let of_view = |h, frame, geometry: *const nertca_geometry| unsafe {
+        nertca_reconstruction_set_view_geometry(h, frame, geometry)
+    };
+    b.refuses(set, NERTCA_ERROR_ARGUMENT, "is null", of_view(b.bare, 0, null()));
+    b.refuses(set, NERTCA_ERROR_ARGUMENT, "0 were added", of_view(b.bare, 0, &geometry(0)));
+    let backwards = nertca_geometry { sod_mm: 2000.0, ..geometry(0) };
+    b.refuses(set, NERTCA_ERROR_ARGUMENT, "sod_mm", of_view(b.trained, 0, &backwards));
+    b.handles(set, stale(b), b.context.cast(), |h| of_view(h, 0, &geometry(0)));
+    let remove = "nertca_reconstruction_remove_frame";
+    b.refuses(remove, NERTCA_ERROR_ARGUMENT, "0 were added", nertca_reconstruction_remove_frame(b.bare, 0));
+    b.handles(remove, stale(b), b.context.cast(), |h| nertca_reconstruction_remove_frame(h, 0));
+    let status = "nertca_reconstruction_frame_status";
+    let size = size_of::<nertca_frame_status>();
+    let ask = |h, frame, status: nertca_frame_status| unsafe {
+        nertca_reconstruction_frame_status(h, frame, &mut { status })
+    };
+    b.refuses(status, NERTCA_ERROR_ARGUMENT, "nertca_frame_status.size", ask(b.trained, 0, zeroed()));
+    b.refuses(
+        status,
+        NERTCA_ERROR_ARGUMENT,
+        "9 were added",
+        ask(b.trained, 9, nertca_frame_status { size, ..zeroed() }),
+    );
+    b.refuses(status, NERTCA_ERROR_ARGUMENT, "is null", unsafe {
+        nertca_reconstruction_frame_status(b.trained, 0, null_mut())
+    });
+    b.handles(status, stale(b), b.context.cast(), |h| ask(h, 0, nertca_frame_status { size, ..zeroed() }));
+    let drawn = "nertca_reconstruction_drawn";
+    let size = size_of::<nertca_drawn>();
+    let ask = |h, drawn: nertca_drawn| unsafe { nertca_reconstruction_drawn(h, &mut { drawn }) };
+    b.refuses(drawn, NERTCA_ERROR_NOT_READY, "no live picture", ask(b.bare, nertca_drawn { size, ..zeroed() }));
+    b.handles(drawn, stale(b), b.context.cast(), |h| ask(h, nertca_drawn { size, ..zeroed() }));
 }
 
 fn tree(b: &Bench) {
@@ -452,13 +494,16 @@ fn views(b: &Bench) {
         nertca_reconstruction_render(b.trained, &good, null())
     });
     type Change = fn(&mut nertca_view);
-    let wrong_views: [(&str, Change); 11] = [
+    let wrong_views: [(&str, Change); 14] = [
         ("nertca_view.size", |v| v.size = 8),
         ("nertca_geometry.size", |v| v.geometry.size = 0),
         ("width", |v| v.width = 0),
         ("height", |v| v.height = 9000),
         ("phase", |v| v.phase = 3),
         ("phase", |v| v.phase = u32::MAX),
+        ("after_phase", |v| v.after_phase = -0.1),
+        ("after_phase", |v| v.after_phase = 1.0),
+        ("after_phase", |v| v.after_phase = f64::NAN),
         ("component", |v| v.component = 3),
         ("projection", |v| v.projection = 2),
         ("quality", |v| v.quality = 2),

@@ -99,7 +99,7 @@ impl Pool {
     }
 
     fn step(&mut self) -> nertca_status {
-        let n = self.random.below(30);
+        let n = self.random.below(31);
         match n {
             0 => {
                 let options = if self.device {
@@ -278,7 +278,24 @@ impl Pool {
             }
             28 => {
                 let (r, frame, geometry) = (self.reconstruction(), self.random.below(12) as u32, self.geometry());
-                unsafe { nertca_reconstruction_set_geometry(r, frame, &geometry) }
+                match self.random.below(3) {
+                    0 => unsafe { nertca_reconstruction_set_geometry(r, frame, &geometry) },
+                    1 => unsafe { nertca_reconstruction_set_view_geometry(r, frame, &geometry) },
+                    _ => nertca_reconstruction_remove_frame(r, frame),
+                }
+            }
+            29 => {
+                let (r, frame) = (self.reconstruction(), self.random.below(12) as u32);
+                let mut status = nertca_frame_status { size: self.random.below(48), ..zeroed() };
+                status.size = status.size.min(size_of::<nertca_frame_status>());
+                let mut drawn = nertca_drawn { size: self.random.below(24), ..zeroed() };
+                drawn.size = drawn.size.min(size_of::<nertca_drawn>());
+                match self.random.below(4) {
+                    0 => nertca_reconstruction_cancel(r),
+                    1 => unsafe { nertca_reconstruction_beat_phase(r, self.random.number(), &mut 0.0) },
+                    2 => unsafe { nertca_reconstruction_drawn(r, &mut drawn) },
+                    _ => unsafe { nertca_reconstruction_frame_status(r, frame, &mut status) },
+                }
             }
             _ => {
                 let mut text = [0; 64];

@@ -31,4 +31,5 @@ mod nerfca;
 #[cfg(feature = "dicom")]
 mod pydicom;
 mod real_data;
+mod same_view;
 mod units_and_spaces;

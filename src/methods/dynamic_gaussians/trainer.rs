@@ -143,6 +143,10 @@ impl Fit for GaussiansFit {
         self.gaussians.as_ref().and_then(GaussianFit::preparation)
     }
 
+    fn shows_earlier(&self) -> bool {
+        self.shows_earlier
+    }
+
     fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
         if self.gaussians.is_none() || self.fields.step() >= until {
             return self.fields.advance(until);
