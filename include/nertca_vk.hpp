@@ -106,8 +106,25 @@ class Reconstruction : public detail::Owner<nertca_reconstruction, nertca_recons
   void set_geometry(std::uint32_t frame, const nertca_geometry &geometry) {
     check(nertca_reconstruction_set_geometry(handle_, frame, &geometry));
   }
+  // For all frames of the frame's view.
+  void set_view_geometry(std::uint32_t frame, const nertca_geometry &geometry) {
+    check(nertca_reconstruction_set_view_geometry(handle_, frame, &geometry));
+  }
+  void remove_frame(std::uint32_t frame) { check(nertca_reconstruction_remove_frame(handle_, frame)); }
+  nertca_frame_status frame_status(std::uint32_t frame) const {
+    nertca_frame_status status = make<nertca_frame_status>();
+    check(nertca_reconstruction_frame_status(handle_, frame, &status));
+    return status;
+  }
+  // No times clear them.
   void set_r_peaks(const std::vector<double> &times_s) {
-    check(nertca_reconstruction_set_r_peaks(handle_, times_s.data(), times_s.size()));
+    check(nertca_reconstruction_set_r_peaks(handle_, times_s.empty() ? nullptr : times_s.data(), times_s.size()));
+  }
+  // Phase of a time by the R-peaks, usually between two: its whole part and the rest are `phase` and `after_phase` of a view.
+  double beat_phase(double time_s) const {
+    double phase = 0;
+    check(nertca_reconstruction_beat_phase(handle_, time_s, &phase));
+    return phase;
   }
   // Trains in this thread; returns the iterations done. An exception of the observer ends training and is thrown on.
   std::uint32_t train(std::uint32_t iterations, const Observer &observer = Observer()) {
@@ -171,6 +188,14 @@ class Reconstruction : public detail::Owner<nertca_reconstruction, nertca_recons
     check(nertca_reconstruction_render(handle_, &view, &image));
     return pixels;
   }
+  // Which field the last live picture showed.
+  nertca_drawn drawn() const {
+    nertca_drawn drawn = make<nertca_drawn>();
+    check(nertca_reconstruction_drawn(handle_, &drawn));
+    return drawn;
+  }
+  // Ends `evaluate`, `tree`, `sample` and exact pictures in other threads, which throw NERTCA_ERROR_CANCELLED.
+  void cancel() { check(nertca_reconstruction_cancel(handle_)); }
   // Attenuation per mm, left fastest.
   std::vector<float> sample(const nertca_grid &grid) {
     std::vector<float> values(static_cast<std::size_t>(grid.points[0]) * grid.points[1] * grid.points[2]);

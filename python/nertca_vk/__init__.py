@@ -36,7 +36,7 @@ from .errors import (
 from .geometry import CArm, Geometry
 from .intensity import Integral, Intensity, Linear, Logarithmic
 from .reconstruction import Component, Projection, Quality, Reconstruction, Split
-from .results import Branch, Correction, Device, Grid, Progress, Scores, Tree
+from .results import Branch, Correction, Device, Drawn, FrameStatus, Grid, Progress, Scores, Tree
 
 __version__ = _version()
 
@@ -56,9 +56,11 @@ __all__ = [
     "DeviceLostError",
     "DeviceMemoryError",
     "DivergedError",
+    "Drawn",
     "Error",
     "FileError",
     "ForkedError",
+    "FrameStatus",
     "Geometry",
     "Grid",
     "HandleError",

@@ -31,7 +31,7 @@ from .context import Context
 from .errors import BufferTooSmallError, Error
 from .geometry import Geometry, as_struct
 from .intensity import Integral, Intensity
-from .results import Branch, Correction, CorrectionKind, Grid, Progress, Scores, Tree
+from .results import Branch, Correction, CorrectionKind, Drawn, FrameStatus, FrameUse, Grid, Progress, Scores, Tree
 
 Component = Literal["total", "static", "dynamic"]
 """Both fields, the static background, or the dynamic field."""
@@ -65,21 +65,27 @@ def _as_grid(grid: Grid) -> Any:
 
 
 def _as_view(
-    geometry: Geometry, rows: int, columns: int, phase: int, component: str, projection: str, quality: str
+    geometry: Geometry, rows: int, columns: int, phase: float, component: str, projection: str, quality: str
 ) -> tuple[Any, Any]:
     """A `nertca_view *`, not to be written to, and what must be kept while it is used."""
     view = new("nertca_view")
     view.height, view.width = whole("shape", rows, 1, 8192), whole("shape", columns, 1, 8192)
     stated, kept = as_struct(geometry)
     view.geometry = stated[0]
-    view.phase = whole("phase", phase)
+    if isinstance(phase, (float, np.floating)):
+        moment = real("phase", phase)
+        if not 0 <= moment < LARGEST_U32:
+            raise wrong("phase", f"{moment} is not a time in the beat, counted in phases from 0")
+        view.phase, view.after_phase = int(moment), moment % 1.0
+    else:
+        view.phase = whole("phase", phase)
     view.component = constant("component", component, "NERTCA_COMPONENT_")
     view.projection = constant("projection", projection, "NERTCA_PROJECTION_")
     view.quality = constant("quality", quality, "NERTCA_QUALITY_")
     return view, kept
 
 
-# A beat is drawn again and again from where it was drawn. Typed: 1.0 is no phase where 1 is one.
+# A beat is drawn again and again from where it was drawn. Typed: True is no phase where 1 is one.
 _known_view = functools.lru_cache(maxsize=1024, typed=True)(_as_view)
 
 
@@ -264,7 +270,8 @@ class Reconstruction:
         """Gives the times of the R-peaks, seconds, rising: frames with time stamps get their phase from them, and where one
         set of Gaussians moves they are fitted at their own time within it.
 
-        Replaces those given earlier, so that a growing list can be given again and again.
+        Replaces those given earlier, so that a growing list can be given again and again; an empty list clears them. The phases 0
+        to T - 1 are the middles of T equal parts of the beat, so a frame at an R-peak is at T - 0.5.
         """
         try:
             times = np.ascontiguousarray(times_s, dtype=np.float64)
@@ -273,7 +280,7 @@ class Reconstruction:
         if times.ndim != 1:
             raise wrong("times_s", f"an array of shape {times.shape}; a list of times is needed")
         handle = self.handle
-        given = ffi.from_buffer("double[]", times)
+        given = ffi.from_buffer("double[]", times) if len(times) else ffi.NULL
         check(lib.nertca_reconstruction_set_r_peaks(handle, given, len(times)), handle)
 
     def correction(self, frame: int) -> Correction:
@@ -299,7 +306,9 @@ class Reconstruction:
         )
 
     def set_geometry(self, frame: int, geometry: Geometry) -> None:
-        """States another geometry for a frame that was added; training takes it in as it does a new frame.
+        """States another geometry for a frame that was added; training in the background takes it in as it does a new frame,
+        training that has ended when it is next started. A frame whose geometry no other frame shares is a view of its own, which
+        may be left out: `frame_status` tells.
 
         Raises ArgumentError naming what is wrong; BusyError while training in the background in a deterministic context.
         """
@@ -307,6 +316,45 @@ class Reconstruction:
         handle = self.handle
         check(lib.nertca_reconstruction_set_geometry(handle, whole("frame", frame), stated), handle)
         del kept
+
+    def set_view_geometry(self, frame: int, geometry: Geometry) -> None:
+        """States another geometry for a frame and for all other frames of its view, as `set_geometry` does for one."""
+        stated, kept = as_struct(geometry)
+        handle = self.handle
+        check(lib.nertca_reconstruction_set_view_geometry(handle, whole("frame", frame), stated), handle)
+        del kept
+
+    def remove_frame(self, frame: int) -> None:
+        """Removes a frame; the others keep their numbers. Training takes that in as it does a new frame.
+
+        Raises ArgumentError for a frame that was not added, or was removed before; BusyError while training in the background in
+        a deterministic context.
+        """
+        handle = self.handle
+        check(lib.nertca_reconstruction_remove_frame(handle, whole("frame", frame)), handle)
+
+    def frame_status(self, frame: int) -> FrameStatus:
+        """Phase, view and use of a frame. Raises ArgumentError for a frame that was not added or was removed."""
+        handle = self.handle
+        found = new("nertca_frame_status")
+        check(lib.nertca_reconstruction_frame_status(handle, whole("frame", frame), found), handle)
+        return FrameStatus(
+            usage=cast(FrameUse, constant_name(found.usage, "NERTCA_USE_")),
+            taken_in=found.taken_in == 1,
+            view=found.view,
+            phase=found.phase if found.phase >= 0 else None,
+            after_phase=found.after_phase,
+        )
+
+    def beat_phase(self, time_s: float) -> float:
+        """Phase of a time in seconds by the R-peaks, usually between two: a `phase` for `render`.
+
+        Raises NotReadyError for a time that R-peaks do not cover.
+        """
+        handle = self.handle
+        phase = ffi.new("double *")
+        check(lib.nertca_reconstruction_beat_phase(handle, real("time_s", time_s), phase), handle)
+        return float(phase[0])
 
     # Training
 
@@ -425,7 +473,7 @@ class Reconstruction:
         self,
         geometry: Geometry,
         shape: tuple[int, int],
-        phase: int = 0,
+        phase: float = 0,
         *,
         component: Component = "total",
         projection: Projection = "drr",
@@ -434,9 +482,12 @@ class Reconstruction:
     ) -> "npt.NDArray[np.float32]":
         """Draws a view, also while training: line integrals, or 1/mm for a maximum projection; shape (rows, columns).
 
+        phase: a float may lie between two phases, which live quality draws as line integrals of one set of moving Gaussians, and
+            exact quality also for networks.
         out: an array of that shape to draw into instead of a new one, float32, rows following each other at once.
 
-        Raises NotReadyError before anything was trained or loaded; ArgumentError naming what is wrong.
+        Live pictures pass while other threads train, evaluate, or draw exact ones. Raises NotReadyError before anything was trained
+        or loaded; CancelledError for an exact picture that `cancel` ended; ArgumentError naming what is wrong.
         """
         rows, columns = shape
         try:
@@ -450,6 +501,18 @@ class Reconstruction:
         check(lib.nertca_reconstruction_render(handle, view, picture), handle)
         del kept
         return drawn
+
+    def drawn(self) -> Drawn:
+        """Which field the last live picture showed. Raises NotReadyError before the first one."""
+        handle = self.handle
+        found = new("nertca_drawn")
+        check(lib.nertca_reconstruction_drawn(handle, found), handle)
+        return Drawn(frames=found.frames, step=found.step)
+
+    def cancel(self) -> None:
+        """Ends `evaluate`, `tree`, `volume` and exact pictures that are under way in other threads, which raise CancelledError."""
+        handle = self.handle
+        check(lib.nertca_reconstruction_cancel(handle), handle)
 
     def volume(
         self,

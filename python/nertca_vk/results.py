@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 State = Literal["idle", "running", "paused", "waiting", "finished", "cancelled", "failed"]
 CorrectionKind = Literal["stated", "static", "breathing"]
+FrameUse = Literal["training", "validation", "no_phase", "one_phase"]
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,33 @@ class Correction:
     """And after."""
     matrix: npt.NDArray[np.float64]
     """All of it, as a projection of shape (3, 4): a geometry to draw the vessels over the frame with."""
+
+
+@dataclass(frozen=True)
+class FrameStatus:
+    """Phase, view and use of a frame."""
+
+    usage: FrameUse
+    """"training"; "validation"; "no_phase" while R-peaks do not cover its time; "one_phase" where training frames show its view
+    at one phase only, so that nothing in it is known to move."""
+    taken_in: bool
+    """Whether training used it, as it is now, when it last took frames in."""
+    view: int
+    """Number of its view: frames of one size whose geometries agree within a tenth of a pixel have the same."""
+    phase: Optional[int]
+    """Phase nearest to its time, from 0; None while it is not known."""
+    after_phase: float
+    """Time after that phase, counted in phases, from -0.5 to 0.5; -0.5 after phase 0 for a frame at an R-peak."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Field that a live picture showed."""
+
+    frames: int
+    """Frames that it was fitted to; 0 for a checkpoint that was loaded."""
+    step: int
+    """Iterations after which the oldest part of the picture was read."""
 
 
 @dataclass(frozen=True)

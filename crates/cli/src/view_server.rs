@@ -436,6 +436,7 @@ mod tests {
         let serving = std::thread::spawn(move || server.serve(async { drop(ended.await) }));
         let ask = || {
             let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
+            stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
             stream.write_all(picture.as_bytes()).unwrap();
             stream
         };

@@ -46,6 +46,8 @@ def test_every_status_has_an_exception() -> None:
         ("nertca_progress", results.Progress),
         ("nertca_correction", results.Correction),
         ("nertca_scores", results.Scores),
+        ("nertca_frame_status", results.FrameStatus),
+        ("nertca_drawn", results.Drawn),
         ("nertca_geometry", nertca_vk.CArm),
         ("nertca_grid", results.Grid),
     ],

@@ -130,6 +130,10 @@ def test_geometries_that_cannot_be(context: Context, given: Any, said: str) -> N
         ({"shape": (2.5, 5)}, "shape: 2.5"),
         ({"phase": PHASES}, "phase"),
         ({"phase": -1}, "phase"),
+        ({"phase": -0.5}, "phase: -0.5"),
+        ({"phase": NAN}, "phase: nan"),
+        ({"phase": PHASES + 0.5}, "phase"),
+        ({"phase": 0.5, "projection": "mip"}, "between two phases"),
         ({"component": "vessels"}, "component: 'vessels' is not one of "),
         ({"projection": "mean"}, "projection"),
         ({"quality": "best"}, "quality"),
@@ -172,7 +176,7 @@ def test_grids_too_large_for_any_memory(context: Context) -> None:
             made.volume(Grid((0, 0, 0), (1, 1, 1), (4096, 4096, 4096)))
 
 
-@pytest.mark.parametrize("times", [[], [1.0], [2.0, 1.0], [0.0, NAN], [[1.0, 2.0]], ["a"], None])
+@pytest.mark.parametrize("times", [[1.0], [2.0, 1.0], [0.0, NAN], [[1.0, 2.0]], ["a"], None])
 def test_r_peaks_that_cannot_be(context: Context, times: Any) -> None:
     with empty(context) as made, pytest.raises(ArgumentError):
         made.set_r_peaks(times)

@@ -3,6 +3,7 @@
 import json
 import logging
 import subprocess
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -265,3 +266,60 @@ def test_devices_are_listed() -> None:
     found = nertca_vk.devices()
     assert len(found) >= 1 and all(device.name and len(device.uuid) == 32 for device in found)
     assert any(device.unusable is None for device in found)
+
+
+def test_frames_tell_their_phase_view_and_use(context: Context) -> None:
+    with filled(context) as made:
+        status = made.frame_status(4)
+        assert (status.usage, status.view, status.phase, status.after_phase, status.taken_in) == ("training", 1, 1, 0.0, False)
+        better = CArm(50.0, -10.0, sid_mm=1000.0, sod_mm=600.0, pixel_mm=120.0 / SIZE)
+        made.set_geometry(4, better)
+        assert made.frame_status(4).usage == "one_phase"
+        made.set_view_geometry(4, geometry(1))
+        assert made.frame_status(4) == status
+        added = made.add_frame(pixels(0, 0), geometry(0), time_s=1.0)
+        assert (made.frame_status(added).usage, made.frame_status(added).phase) == ("no_phase", None)
+        made.set_r_peaks([1.0, 2.0])
+        assert (made.frame_status(added).phase, made.frame_status(added).after_phase) == (0, -0.5)
+        assert made.beat_phase(1.0) == PHASES - 0.5
+        made.set_r_peaks([])
+        with pytest.raises(nertca_vk.NotReadyError):
+            made.beat_phase(1.0)
+        made.remove_frame(added)
+        with pytest.raises(nertca_vk.ArgumentError, match="was removed"):
+            made.frame_status(added)
+        made.train(1)
+        assert made.frame_status(4).taken_in
+        with pytest.raises(nertca_vk.NotReadyError):
+            made.drawn()
+        made.render(geometry(0), (SIZE, SIZE))
+        assert made.drawn() == nertca_vk.Drawn(frames=VIEWS * PHASES, step=1)
+
+
+def test_pictures_between_phases(context: Context) -> None:
+    with filled(context, **{"gaussians.form": "deformable"}) as made:
+        made.train()
+        live = [made.render(geometry(0), (SIZE, SIZE), phase, component="dynamic") for phase in (0, 0.5, 1)]
+        assert np.abs(live[1] - live[0]).max() > 1e-3 and np.abs(live[1] - live[2]).max() > 1e-3
+        assert np.array_equal(live[0], made.render(geometry(0), (SIZE, SIZE), 0.0, component="dynamic"))
+
+
+def test_long_work_can_be_cancelled(context: Context) -> None:
+    with filled(context) as made:
+        made.add_frame(pixels(0, 0), geometry(0), phase=0, split="validation")
+        made.train(1)
+        ended: list[BaseException] = []
+
+        def evaluate() -> None:
+            try:
+                while True:
+                    made.evaluate()
+            except nertca_vk.CancelledError as error:
+                ended.append(error)
+
+        worker = threading.Thread(target=evaluate)
+        worker.start()
+        while worker.is_alive():
+            made.cancel()
+        assert len(ended) == 1
+        assert made.evaluate().images == 1
