@@ -225,10 +225,11 @@ pub(super) fn check_lengths(file: &Path, tree: &TreeFile, sight: &Sight, voxel_m
     let bounds = tree.bounds();
     let extent = bounds.high_mm - bounds.low_mm;
     let voxels: f64 = grid_size(bounds, voxel_mm).iter().map(|n| *n as f64).product();
-    if voxels.is_nan() || voxels > MAX_DRAWN_VOXELS {
+    let beyond = extent.max_element() > 2.0 * sight.sod_mm;
+    if voxels.is_nan() || voxels > MAX_DRAWN_VOXELS || beyond {
         let problem = format!(
-            "the vessels extend over {} x {} x {} mm, too much to be drawn with voxels of {voxel_mm} mm; they lie {}, and {}. \
-             Check the largest coordinates: {UNITS}",
+            "the vessels extend over {} x {} x {} mm, which is too much for the views and for voxels of {voxel_mm} mm; they lie {}, \
+             and {}. Check the largest coordinates: {UNITS}",
             mm(extent.x),
             mm(extent.y),
             mm(extent.z),
