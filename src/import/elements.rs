@@ -509,7 +509,10 @@ impl Element {
             VR::FL | VR::OF => numbers(bytes, big_endian, |b| f32::from_le_bytes(b).into()),
             VR::FD | VR::OD => numbers(bytes, big_endian, f64::from_le_bytes),
             VR::OB | VR::UN | VR::AT => Err(format!("has the type {}, which holds no numbers", self.vr)),
-            _ => text_of(bytes).split('\\').filter(|_| !text_of(bytes).is_empty()).map(number_of).collect(),
+            _ => match text_of(bytes) {
+                empty if empty.is_empty() => Ok(Vec::new()),
+                list => list.split('\\').map(number_of).collect(),
+            },
         }
     }
 
