@@ -130,6 +130,7 @@ pub mod import {
     pub mod dicom;
     pub mod ecg;
     mod elements;
+    mod enhanced;
     pub mod folder;
     mod frames;
     pub mod image_beat;

@@ -5,6 +5,7 @@ use crate::fingerprint::Fingerprint;
 use crate::geometry::CArm;
 use crate::import::codecs::Codec;
 use crate::import::elements::{self, Content, numbers};
+use crate::import::enhanced::{self, Groups};
 use crate::import::frames::{self, Layout};
 use crate::import::reader::Reader;
 use crate::import::stated::StatedGeometry;
@@ -164,6 +165,7 @@ impl Run {
         let Content { syntax, data, mut notes } = elements::read(path)?;
         let r = Reader { data: &data, path };
         r.check_modality()?;
+        enhanced::check_class(&r)?;
         let codec =
             Codec::of(&syntax).map_err(|problem| r.bad(tags::TRANSFER_SYNTAX_UID, "TransferSyntaxUID", problem))?;
         let side = |tag, name| -> Result<usize> {
@@ -188,16 +190,24 @@ impl Run {
                 "all frames together have more pixels than the accepted maximum",
             ));
         }
-        let c_arms = r.c_arms(n, [width, height], stated, &mut notes)?;
-        let times_s = timing::times(&r, n, &mut notes)?;
+        let groups = Groups::of(&r, n)?;
+        let c_arms = match &groups {
+            Some(groups) => r.possible(groups.c_arms(stated, &mut notes)?, [width, height])?,
+            None => r.c_arms(n, [width, height], stated, &mut notes)?,
+        };
+        let times_s = match groups.as_ref().and_then(Groups::times_s) {
+            Some(times_s) => times_s,
+            None => timing::times(&r, n, &mut notes)?,
+        };
         let table = r.modality_table()?;
         let relationship = match table {
             // Part 3, C.8.7.1.1.2: the table of an angiogram leads from stored values to values linear in intensity.
             Some(_) => Relationship::Linear,
-            None => r.relationship(&mut notes),
+            None => r.relationship(groups.as_ref(), &mut notes),
         };
-        let (frames, range) = r.frames(codec, n, [width, height], table.as_ref(), &mut notes)?;
-        let r_peaks = r.r_peaks(&times_s, &mut notes);
+        let (frames, range) = r.frames(codec, n, [width, height], table.as_ref(), groups.as_ref(), &mut notes)?;
+        let stated = groups.as_ref().and_then(|groups| groups.r_peaks(&times_s, &mut notes));
+        let r_peaks = stated.or_else(|| r.r_peaks(&times_s, &mut notes));
         let hashed = |tag| Fingerprint::of(r.text(tag).unwrap_or_default().as_bytes()).value();
         let identity = [tags::PATIENT_ID, tags::STUDY_INSTANCE_UID].map(hashed);
         let instance = r.text(tags::SOP_INSTANCE_UID).map(|uid| Fingerprint::of(uid.as_bytes()).value());
@@ -211,7 +221,11 @@ impl Run {
             c_arms,
             times_s,
             r_peaks,
-            open: r.open_area(width, height)?,
+            open: match &groups {
+                Some(groups) => shared_area(groups.shutters()?.iter().map(|shutter| shutter.open_area(width, height)))?
+                    .map_or_else(|| r.open_area(width, height), Ok)?,
+                None => r.open_area(width, height)?,
+            },
             burnt_in: r.text(tags::BURNED_IN_ANNOTATION).is_some_and(|t| t.eq_ignore_ascii_case("YES")),
             identity,
             instance,
@@ -307,13 +321,19 @@ impl Reader<'_> {
                 table_mm: [left[i], down[i], along[i]],
             })
             .collect();
-        let rays =
-            crate::geometry::Geometry::CArm(CArm { table_mm: [0.0; 3], ..arms[0].clone() }).rays(size[0], size[1]);
+        self.possible(arms, size)
+    }
+
+    /// Checks that a C-arm as that of the first frame can exist.
+    fn possible(&self, arms: Vec<CArm>, size: [usize; 2]) -> Result<Vec<CArm>> {
+        let first = CArm { table_mm: [0.0; 3], ..arms[0].clone() };
+        let rays = crate::geometry::Geometry::CArm(first).rays(size[0], size[1]);
         rays.map(|_| arms).map_err(|(field, problem)| Error::data(self.path, tag_of(&field), problem))
     }
 
-    fn relationship(&self, notes: &mut Vec<String>) -> Relationship {
-        match self.text(tags::PIXEL_INTENSITY_RELATIONSHIP).as_deref() {
+    fn relationship(&self, groups: Option<&Groups<'_>>, notes: &mut Vec<String>) -> Relationship {
+        let stated = self.text(tags::PIXEL_INTENSITY_RELATIONSHIP).or_else(|| groups?.relationship());
+        match stated.as_deref() {
             Some("LIN") => Relationship::Linear,
             Some("LOG") => Relationship::Log,
             other => {
@@ -367,6 +387,7 @@ impl Reader<'_> {
         n: usize,
         size: [usize; 2],
         table: Option<&ModalityTable>,
+        groups: Option<&Groups<'_>>,
         notes: &mut Vec<String>,
     ) -> Result<(Vec<Vec<f32>>, PixelRange)> {
         let bits = self.number(tags::BITS_STORED, "BitsStored")?.unwrap_or(8.0);
@@ -399,8 +420,13 @@ impl Reader<'_> {
         };
         let mut frames = frames::decode(self.data, codec, &layout, notes)
             .map_err(|problem| self.bad(tags::PIXEL_DATA, "PixelData", problem))?;
-        let slope = self.number(tags::RESCALE_SLOPE, "RescaleSlope")?.unwrap_or(1.0);
-        let intercept = self.number(tags::RESCALE_INTERCEPT, "RescaleIntercept")?.unwrap_or(0.0);
+        let [slope, intercept] = match groups.map_or(Ok(None), Groups::rescale)? {
+            Some(rescale) => rescale,
+            None => [
+                self.number(tags::RESCALE_SLOPE, "RescaleSlope")?.unwrap_or(1.0),
+                self.number(tags::RESCALE_INTERCEPT, "RescaleIntercept")?.unwrap_or(0.0),
+            ],
+        };
         let is_rescaled = slope != 1.0 || intercept != 0.0;
         match table {
             Some(_) => notes.push(
@@ -474,6 +500,17 @@ impl Reader<'_> {
         }
         traces::r_peaks(self, length_s(times_s), notes)
     }
+}
+
+/// Columns and rows inside all shutters; none without shutters.
+type Area = (Range<usize>, Range<usize>);
+
+fn shared_area(areas: impl Iterator<Item = Result<Area>>) -> Result<Option<Area>> {
+    let within = |a: &Range<usize>, b: &Range<usize>| a.start.max(b.start)..a.end.min(b.end);
+    areas.fold(Ok(None), |sum: Result<Option<Area>>, area| {
+        let (sum, area) = (sum?, area?);
+        Ok(Some(sum.map_or(area.clone(), |sum| (within(&sum.0, &area.0), within(&sum.1, &area.1)))))
+    })
 }
 
 /// Length of a run, seconds: its last frame lasts as long as the one before.

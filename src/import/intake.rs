@@ -202,9 +202,13 @@ fn check(run: &Run, before: &[AcceptedRun]) -> Vec<String> {
     }
     let [left, down, along] = [0, 1, 2].map(|k| this.table_mm[k] - first.table_mm[k]);
     if [left, down, along] != [0.0; 3] {
+        let lengthwise = if along == 0.0 {
+            "; XA objects do not store a motion along the patient in public tags".to_owned()
+        } else {
+            format!(", including {along} mm towards the head")
+        };
         notes.push(format!(
-            "{name}: the table moved by {left} mm to the left and {down} mm down since {}, which was corrected; a \
-             motion along the patient is not stored in public tags",
+            "{name}: the table moved by {left} mm to the left and {down} mm down since {}, which was corrected{lengthwise}",
             first.name
         ));
     }

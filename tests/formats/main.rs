@@ -15,6 +15,8 @@ mod root;
 mod shared;
 
 #[cfg(feature = "dicom")]
+mod dicom_enhanced;
+#[cfg(feature = "dicom")]
 mod dicom_fragments;
 #[cfg(feature = "dicom")]
 mod dicom_runs;

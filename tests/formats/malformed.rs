@@ -200,6 +200,55 @@ fn sizes_that_files_only_claim_reserve_no_memory() {
 }
 
 #[test]
+fn compressed_and_enhanced_angiograms() {
+    let files = crate::pydicom::Files::by(
+        "
+import PIL.Image, SimpleITK
+from pydicom import encaps
+from pydicom.dataset import Dataset
+d = read()
+pixels = d.pixel_array
+d.compress(pydicom.uid.RLELossless)
+save('rle', d, pixels)
+def jpeg(frame):
+    b = io.BytesIO()
+    PIL.Image.fromarray(frame).save(b, 'JPEG')
+    return b.getvalue()
+def lossless(frame):
+    writer = SimpleITK.ImageFileWriter()
+    writer.SetImageIO('GDCMImageIO')
+    writer.UseCompressionOn()
+    writer.SetCompressor('JPEG')
+    writer.SetFileName(str(out / 'one.dat'))
+    writer.Execute(SimpleITK.GetImageFromArray(frame[None]))
+    return next(encaps.generate_frames(pydicom.dcmread(out / 'one.dat').PixelData, number_of_frames=1))
+for name, syntax, encode in (('jpeg', pydicom.uid.JPEGBaseline8Bit, jpeg), ('lossless', pydicom.uid.JPEGLosslessSV1, lossless)):
+    d = read()
+    d.file_meta.TransferSyntaxUID = syntax
+    d.PixelData = encaps.encapsulate([encode(frame) for frame in pixels], fragments_per_frame=2, has_bot=False)
+    d['PixelData'].VR = 'OB'
+    save(name, d, pixels)
+def group(**values):
+    d = Dataset()
+    for name, value in values.items():
+        setattr(d, name, value)
+    return d
+d = read()
+d.SharedFunctionalGroupsSequence = [group(
+    XRayGeometrySequence=[group(DistanceSourceToIsocenter=700.0, DistanceSourceToDetector=1000.0)],
+    FramePixelDataPropertiesSequence=[group(ImagerPixelSpacing=[2.0, 1.5])],
+    PositionerPositionSequence=[group(PositionerPrimaryAngle=30.0, PositionerSecondaryAngle=-20.0)])]
+d.PerFrameFunctionalGroupsSequence = [group(FrameContentSequence=[group(FrameReferenceDateTime=f'2026112612000{k}')]) for k in range(6)]
+save('enhanced', d, pixels)
+write('unknown', before_pixels(element(0x21, 0x1010, b'UN', item(implicit(0x21, 0x1011, item(b'') + END)) + END)))
+",
+    );
+    let seeds: Vec<Vec<u8>> = files.names().iter().map(|name| std::fs::read(files.path(name)).unwrap()).collect();
+    assert_eq!(seeds.len(), 5);
+    feed("c.dcm", &seeds, |p| nertca_vk::import::dicom::Run::read(p, None).is_ok());
+}
+
+#[test]
 fn ecg_traces() {
     let seeds = || vec![(0..400).map(|i| if i % 80 < 3 { 250 } else { (i % 7) as u8 }).collect()];
     let parse = |path: &std::path::Path| {
