@@ -1,8 +1,16 @@
 //! Transfer syntaxes, and images as they compress them: one frame of grey values at a time.
 
 use crate::import::elements::syntax;
+use hayro_jpeg2000::{DecodeSettings, DecoderContext, Image};
 use jpeg_decoder::{Decoder, PixelFormat, UnsupportedFeature};
 
+/// Marker with which a JPEG 2000 codestream begins; the marker of its size follows.
+const START_OF_CODESTREAM: [u8; 2] = [0xff, 0x4f];
+const SIZE_MARKER: [u8; 2] = [0xff, 0x51];
+/// Offset of the precision of the first component in a JPEG 2000 codestream, bytes (ISO 15444-1, A.5.1).
+const PRECISION_AT: usize = 42;
+/// Bit of a precision that says that values are signed.
+const IS_SIGNED: u8 = 0x80;
 /// Bytes of the header of an RLE image: the number of its segments, and 15 offsets.
 const RLE_HEADER_BYTES: usize = 64;
 
@@ -13,6 +21,7 @@ pub(super) enum Codec {
     Native,
     Rle,
     Jpeg,
+    Jpeg2000,
 }
 
 impl Codec {
@@ -32,13 +41,19 @@ impl Codec {
             | "1.2.840.10008.1.2.4.55"
             | "1.2.840.10008.1.2.4.57"
             | "1.2.840.10008.1.2.4.70" => Ok(Codec::Jpeg),
+            // Lossless, and either.
+            "1.2.840.10008.1.2.4.90" | "1.2.840.10008.1.2.4.91" => Ok(Codec::Jpeg2000),
             other => Err(not_read(other)),
         }
     }
 
-    /// Tells whether each frame ends with the end-of-image marker of the JPEG standards.
-    pub(super) fn has_markers(self) -> bool {
-        matches!(self, Codec::Jpeg)
+    /// Marker with which each frame begins, where the codec has markers; all end with the same one.
+    pub(super) fn first_marker(self) -> Option<[u8; 2]> {
+        match self {
+            Codec::Native | Codec::Rle => None,
+            Codec::Jpeg => Some([0xff, 0xd8]),
+            Codec::Jpeg2000 => Some(START_OF_CODESTREAM),
+        }
     }
 
     /// Decodes the grey values of a frame of `size` (columns, rows), each with the bits that are stored for it.
@@ -50,6 +65,7 @@ impl Codec {
             Codec::Native => native(bytes, size[0] * size[1], bytes_per_value, false),
             Codec::Rle => rle(bytes, size[0] * size[1], bytes_per_value),
             Codec::Jpeg => jpeg(bytes, size),
+            Codec::Jpeg2000 => jpeg2000(bytes, size),
         }
     }
 }
@@ -59,7 +75,6 @@ fn not_read(uid: &str) -> String {
     let (name, tool) = match uid {
         "1.2.840.10008.1.2.4.80" => ("JPEG-LS", "dcmdjpls"),
         "1.2.840.10008.1.2.4.81" => ("JPEG-LS near-lossless", "dcmdjpls"),
-        "1.2.840.10008.1.2.4.90" | "1.2.840.10008.1.2.4.91" => ("JPEG 2000", "gdcmconv --raw"),
         "1.2.840.10008.1.2.4.92" | "1.2.840.10008.1.2.4.93" => ("JPEG 2000 with several components", "gdcmconv --raw"),
         "1.2.840.10008.1.2.4.201" | "1.2.840.10008.1.2.4.202" | "1.2.840.10008.1.2.4.203" => {
             ("High-Throughput JPEG 2000", "gdcmconv --raw")
@@ -161,6 +176,35 @@ fn jpeg(bytes: &[u8], size: [usize; 2]) -> Result<Vec<u32>, String> {
         PixelFormat::L8 => values.into_iter().map(u32::from).collect(),
         _ => values.chunks_exact(2).map(|pair| u16::from_ne_bytes([pair[0], pair[1]]).into()).collect(),
     })
+}
+
+fn jpeg2000(bytes: &[u8], size: [usize; 2]) -> Result<Vec<u32>, String> {
+    let damaged = |error: hayro_jpeg2000::DecodeError| format!("its JPEG 2000 image cannot be decoded: {error}");
+    // A damaged image is not to be read in part.
+    let settings = DecodeSettings { resolve_palette_indices: false, strict: true, target_resolution: None };
+    let image = Image::new(bytes, &settings).map_err(damaged)?;
+    let found = [image.width() as usize, image.height() as usize];
+    if found != size {
+        let [x, y] = found;
+        return Err(format!("its JPEG 2000 image has {x} x {y} pixels where {} x {} are needed", size[0], size[1]));
+    }
+    let mut context = DecoderContext::default();
+    let decoded = image.decode(&mut context).map_err(damaged)?;
+    let [component] = decoded.components() else {
+        return Err("its JPEG 2000 image is in colour, but grey values are needed".into());
+    };
+    // The decoder shifts signed values to positive ones, as it does with unsigned values.
+    let steps = 2f32.powi(component.bit_depth().into());
+    let zero = if is_signed(bytes) { steps / 2.0 } else { 0.0 };
+    let value = |sample: &f32| (sample.round().clamp(0.0, steps - 1.0) - zero) as i32 as u32;
+    Ok(component.samples().iter().map(value).collect())
+}
+
+/// Tells whether the values of a JPEG 2000 codestream are signed.
+fn is_signed(bytes: &[u8]) -> bool {
+    let begin = [START_OF_CODESTREAM, SIZE_MARKER].concat();
+    let codestream = bytes.windows(begin.len()).position(|window| window == begin).map_or(&[][..], |at| &bytes[at..]);
+    codestream.get(PRECISION_AT).is_some_and(|precision| precision & IS_SIGNED != 0)
 }
 
 fn jpeg_problem(error: &jpeg_decoder::Error) -> String {

@@ -7,7 +7,6 @@ use dicom_dictionary_std::tags;
 use rayon::prelude::*;
 use std::borrow::Cow;
 
-const START_OF_IMAGE: [u8; 2] = [0xff, 0xd8];
 const END_OF_IMAGE: [u8; 2] = [0xff, 0xd9];
 /// Bytes at the end of a fragment in which an end of an image is searched: it may be followed by padding.
 const PADDING_BYTES: usize = 10;
@@ -38,7 +37,7 @@ impl Layout {
     /// Value of the bits of a pixel; those that are not stored may hold anything, such as an overlay.
     fn value(&self, bits: u32, codec: Codec) -> f32 {
         // JPEG images hold the stored bits alone.
-        let lowest = if codec.has_markers() { 0 } else { (self.high_bit + 1).saturating_sub(self.bits) };
+        let lowest = if codec.first_marker().is_some() { 0 } else { (self.high_bit + 1).saturating_sub(self.bits) };
         let unused = u32::BITS - self.bits;
         let topmost = bits >> lowest << unused;
         if self.signed { (topmost as i32 >> unused) as f32 } else { (topmost >> unused) as f32 }
@@ -137,8 +136,8 @@ fn frames_of(
             }
         }
     }
-    if codec.has_markers()
-        && let Some(starts) = by_ends(fragments, frames).or_else(|| by_begins(fragments, frames))
+    if let Some(marker) = codec.first_marker()
+        && let Some(starts) = by_ends(fragments, frames).or_else(|| by_begins(fragments, frames, marker))
     {
         return Ok(between(&starts, count));
     }
@@ -172,7 +171,8 @@ fn by_offsets(fragments: &Fragments, table: &[u64], frames: usize) -> Option<Vec
 
 /// Tells whether the fragments at which frames begin also begin images, where that can be seen.
 fn begin_images(fragments: &Fragments, starts: &[usize], codec: Codec) -> bool {
-    !codec.has_markers() || starts.iter().all(|start| fragments.fragments[*start].starts_with(&START_OF_IMAGE))
+    let begins = |marker: [u8; 2]| starts.iter().all(|start| fragments.fragments[*start].starts_with(&marker));
+    codec.first_marker().is_none_or(begins)
 }
 
 /// First fragment of each frame by the ends of images; none unless there is one for each frame.
@@ -189,8 +189,8 @@ fn by_ends(fragments: &Fragments, frames: usize) -> Option<Vec<usize>> {
 }
 
 /// First fragment of each frame by the beginnings of images; none unless there is one for each frame.
-fn by_begins(fragments: &Fragments, frames: usize) -> Option<Vec<usize>> {
-    let begins = |i: &usize| fragments.fragments[*i].starts_with(&START_OF_IMAGE);
+fn by_begins(fragments: &Fragments, frames: usize, marker: [u8; 2]) -> Option<Vec<usize>> {
+    let begins = |i: &usize| fragments.fragments[*i].starts_with(&marker);
     let starts: Vec<usize> = (0..fragments.fragments.len()).filter(begins).collect();
     (starts.len() == frames && starts[0] == 0).then_some(starts)
 }

@@ -193,6 +193,62 @@ compressed('twelve', items([], split(twelve, [1] * 6)[0]), syntax='1.2.840.10008
 }
 
 #[test]
+fn jpeg_2000_frames_are_read() {
+    let files = files(
+        "
+def lossless2000(frame):
+    writer = SimpleITK.ImageFileWriter()
+    writer.SetImageIO('GDCMImageIO')
+    writer.UseCompressionOn()
+    writer.SetCompressor('JPEG2000')
+    path = str(out / 'one.dat')
+    writer.SetFileName(path)
+    writer.Execute(SimpleITK.GetImageFromArray(frame[None]))
+    assert (SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(path))[0] == frame).all()
+    return next(encaps.generate_frames(pydicom.dcmread(path).PixelData, number_of_frames=1))
+SYNTAX = pydicom.uid.JPEG2000Lossless
+rough = np.random.default_rng(1)
+noisy = rough.integers(0, 256, pixels.shape).astype('u1')
+def layout(bits, signed):
+    def change(d):
+        d.BitsAllocated = 8 if bits == 8 else 16
+        d.BitsStored, d.HighBit, d.PixelRepresentation = bits, bits - 1, int(signed)
+    return change
+kinds = {
+    'eight': (pixels, 8, False), 'noisy': (noisy, 8, False), 'twelve': ((noisy.astype('u2') << 4) + 9, 12, False),
+    'sixteen': (rough.integers(0, 65536, pixels.shape).astype('u2'), 16, False),
+    'signed': (rough.integers(-32768, 32768, pixels.shape).astype('i2'), 16, True),
+}
+for name, (values, bits, signed) in kinds.items():
+    images = [lossless2000(frame) for frame in values]
+    compressed(name, items([], split(images, [1] * 6)[0]), syntax=SYNTAX, values=values, change=layout(bits, signed))
+    if name == 'noisy':
+        compressed('fragments', items([], split(images, [1, 2, 1, 3, 2, 1])[0]), syntax=SYNTAX, values=values)
+        images[2] = images[2][:len(images[2]) // 2]
+        compressed('cut', items([], split(images, [1] * 6)[0]), syntax=SYNTAX)
+# A lossy image, decoded by OpenJPEG.
+def lossy(frame):
+    b = io.BytesIO()
+    PIL.Image.fromarray(frame).save(b, 'JPEG2000', no_jp2=True, irreversible=True, quality_mode='rates', quality_layers=[8])
+    return b.getvalue()
+images = [lossy(frame) for frame in pixels]
+decoded = np.stack([np.asarray(PIL.Image.open(io.BytesIO(image))) for image in images])
+compressed('lossy', items([], split(images, [1] * 6)[0]), syntax=pydicom.uid.JPEG2000, values=decoded)
+",
+    );
+    for name in ["eight", "noisy", "twelve", "sixteen", "signed", "fragments"] {
+        files.read(name);
+    }
+    // Decoders may round the samples of lossy images differently.
+    assert!(files.off("lossy") <= 1.0);
+    assert!(
+        files.refusal("cut").contains("frame 3: its JPEG 2000 image cannot be decoded"),
+        "{}",
+        files.refusal("cut")
+    );
+}
+
+#[test]
 fn other_codecs_are_named_with_a_tool_that_converts_them() {
     let files = files(
         "

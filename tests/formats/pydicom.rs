@@ -90,18 +90,30 @@ impl Files {
     /// Reads a file, and checks that its pixels are those that were kept for it.
     #[track_caller]
     pub fn read(&self, name: &str) -> Run {
-        let run = Run::read(&self.path(name), None).unwrap_or_else(|error| panic!("{name}: {error}"));
+        let run = self.run(name);
+        let off = self.apart(name, &run);
+        assert_eq!(off, 0.0, "{name}");
+        run
+    }
+
+    /// Returns how far the pixels of a file are from those that were kept for it.
+    #[track_caller]
+    pub fn off(&self, name: &str) -> f32 {
+        self.apart(name, &self.run(name))
+    }
+
+    #[track_caller]
+    fn run(&self, name: &str) -> Run {
+        Run::read(&self.path(name), None).unwrap_or_else(|error| panic!("{name}: {error}"))
+    }
+
+    #[track_caller]
+    fn apart(&self, name: &str, run: &Run) -> f32 {
         let wanted = std::fs::read(self.directory.path().join(format!("{name}.values"))).unwrap();
         let wanted: Vec<f32> = wanted.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
         let found = run.frames.concat();
-        let off = found.iter().zip(&wanted).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-        assert!(
-            found.len() == wanted.len() && off == 0.0,
-            "{name}: {} values, {} wanted, {off} apart",
-            found.len(),
-            wanted.len()
-        );
-        run
+        assert_eq!(found.len(), wanted.len(), "{name}");
+        found.iter().zip(&wanted).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
     }
 
     /// Refuses a file, and returns the message.
