@@ -45,7 +45,7 @@ impl Source {
 /// When volumes that are older than the source's present iteration are baked anew.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refresh {
-    /// By the picture that shows them, unless the last refresh was too recent.
+    /// By the picture that shows them.
     Now,
     /// By [`Live::refresh_beside`] in another thread; pictures show the volumes there are meanwhile.
     Beside,
@@ -115,8 +115,8 @@ impl Live {
     }
 
     /// Draws a view as [`Baked::render`] does. A volume that was never baked is baked first. One that is older than `step`, the
-    /// source's present iteration, is baked anew as `refresh` says; refreshing takes at most a fifth of the time. A `phase` may
-    /// lie between two for line integrals of one set of Gaussians that moves.
+    /// source's present iteration, is baked anew as `refresh` says. A `phase` may lie between two for line integrals of one set of
+    /// Gaussians that moves.
     ///
     /// # Errors
     /// As [`Renderer::render`]; [`Error::Config`] for a phase between two where it cannot be drawn.
@@ -225,10 +225,9 @@ impl Live {
             let begin = Instant::now();
             let bakes = {
                 let mut freshness = self.freshness();
-                let rests = refresh == Refresh::Beside || begin < freshness.rest_until;
                 let age = &mut freshness.volumes[slot];
                 age.shown = Some(begin);
-                age.baked_at.is_none_or(|baked_at| baked_at != step && !rests)
+                age.baked_at.is_none_or(|baked_at| baked_at != step && refresh == Refresh::Now)
             };
             if bakes {
                 let (field, phase) = volume(slot);

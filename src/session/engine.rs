@@ -57,7 +57,7 @@ pub(super) struct Shared {
     pub(super) viewer: Mutex<Option<Viewer>>,
     /// The last live picture.
     pub(super) drawn: Mutex<Option<Drawn>>,
-    /// Renderer of long work, for which live pictures do not wait.
+    /// Renderer of long work, for which live pictures do not wait. Work under way keeps the source that it began with.
     pub(super) fields: Mutex<Option<LongViewer>>,
     pub(super) long_work: LongWork,
     /// Whether a thread trains at this moment, which then keeps up to date what live pictures show.
@@ -180,7 +180,11 @@ impl Shared {
             published.source = Some(source);
             published.frames = frames.unwrap_or(published.frames);
         }
-        // Long work under way keeps what it began with; nothing else needs the earlier source.
+        self.free_fields();
+    }
+
+    /// Frees the memory of the renderer of long work, unless it is in use.
+    fn free_fields(&self) {
         if let Ok(mut fields) = self.fields.try_lock() {
             *fields = None;
         }
@@ -305,7 +309,7 @@ impl Shared {
         };
         begin();
         if let Some(why) = left_out {
-            tracing::warn!("some frames are not used: {why}");
+            tracing::info!("some frames are not used: {why}");
         }
         let mut tuning = tuning.clone();
         if gpu.info().is_cpu() {
@@ -330,6 +334,7 @@ impl Shared {
             engine.saved = fits.then_some(state);
         }
         (engine.training, engine.version) = (None, 0); // its memory is needed
+        self.free_fields();
         let trainer = match &engine.saved {
             None => Trainer::start_over(gpu, fresh, &dataset, tuning, earlier.as_ref())?,
             Some(state) => {
