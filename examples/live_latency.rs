@@ -39,6 +39,7 @@ fn main() -> Result<()> {
     let tuning = Tuning::for_device(gpu.info());
     println!("{}; pictures of {side} x {side} pixels", gpu.info().name);
     let options = SessionOptions {
+        still: false,
         config: Config::load(Some(Preset::Fast), None, &[])?,
         phases: dataset.n_phases,
         depth_half_extent_mm: dataset.depth_range.1 * MM_PER_UNIT,

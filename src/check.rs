@@ -4,7 +4,7 @@
 //! Views are compared by their changes over the beat ([`mod@agreement`]), which needs neither labels nor a reconstruction.
 //! When they disagree, each of the usual [`mistakes`] is undone in turn, and those after whose correction the views agree
 //! are named. No set of views can distinguish a patient from the mirrored patient. A view accuses others only where its images
-//! say enough; what they cannot say is reported as missing evidence ([`mod@evidence`]).
+//! say enough; what they cannot say is reported as missing evidence (`check/evidence.rs`).
 
 pub mod agreement;
 mod evidence;

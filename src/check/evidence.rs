@@ -1,4 +1,4 @@
-//! What the images of each view say about the agreement of the views, and what they cannot say.
+//! Evidence of each view about the agreement of the views, and what is missing of it.
 
 use crate::calibrate::MIN_CHANGE;
 use crate::calibrate::observed::Observed;

@@ -275,15 +275,10 @@ impl Chosen<'_> {
                     .map_err(|e| Error::data(&run.path, "phases", e.to_string()))?;
                 notes.push(format!(
                     "{}: {:.0} beats per minute, found in the images (the motion of the vessels has a correlation of \
-                     {:.2} with a contracting ventricle){}; a regular rhythm is assumed",
+                     {:.2} with a contracting ventricle); a regular rhythm is assumed",
                     run.name(),
                     found.beats_per_min,
-                    found.likeness,
-                    if found.trend_degree > 0 {
-                        " after slow changes by contrast and breathing were removed"
-                    } else {
-                        ""
-                    }
+                    found.likeness
                 ));
                 Ok(found.r_peaks)
             }

@@ -64,10 +64,16 @@ impl Codec {
         match self {
             Codec::Native => native(bytes, size[0] * size[1], bytes_per_value, false),
             Codec::Rle => rle(bytes, size[0] * size[1], bytes_per_value),
-            Codec::Jpeg => jpeg(bytes, size),
-            Codec::Jpeg2000 => jpeg2000(bytes, size),
+            Codec::Jpeg => caught(|| jpeg(bytes, size)),
+            Codec::Jpeg2000 => caught(|| jpeg2000(bytes, size)),
         }
     }
+}
+
+/// Runs a decoder of others, which may panic on a damaged image; that becomes an error of the file.
+fn caught(decode: impl FnOnce() -> Result<Vec<u32>, String>) -> Result<Vec<u32>, String> {
+    let decoded = std::panic::catch_unwind(std::panic::AssertUnwindSafe(decode));
+    decoded.unwrap_or_else(|_| Err("its image is damaged, and the decoder failed on it".into()))
 }
 
 /// Sentence about a codec that is not read.
@@ -84,7 +90,7 @@ fn not_read(uid: &str) -> String {
         }
         video if video.starts_with("1.2.840.10008.1.2.4.10") => {
             return format!(
-                "is a video ({video}, MPEG or HEVC), which is not read; export the run as images, or as uncompressed DICOM"
+                "is a video (MPEG or HEVC) by {video}, which is not read; export the run as images, or as uncompressed DICOM"
             );
         }
         uid => {

@@ -505,10 +505,10 @@ impl Reader<'_> {
 /// Columns and rows inside all shutters; none without shutters.
 type Area = (Range<usize>, Range<usize>);
 
-fn shared_area(areas: impl Iterator<Item = Result<Area>>) -> Result<Option<Area>> {
+fn shared_area(mut areas: impl Iterator<Item = Result<Area>>) -> Result<Option<Area>> {
     let within = |a: &Range<usize>, b: &Range<usize>| a.start.max(b.start)..a.end.min(b.end);
-    areas.fold(Ok(None), |sum: Result<Option<Area>>, area| {
-        let (sum, area) = (sum?, area?);
+    areas.try_fold(None, |sum: Option<Area>, area| {
+        let area = area?;
         Ok(Some(sum.map_or(area.clone(), |sum| (within(&sum.0, &area.0), within(&sum.1, &area.1)))))
     })
 }

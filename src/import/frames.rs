@@ -63,7 +63,9 @@ pub(super) fn decode(
                 let values = codec.decode(&bytes, layout.size, layout.bytes_per_value);
                 values.map_err(|problem| format!("frame {}: {problem}", i + 1))
             };
-            frames.par_iter().enumerate().map(decode).collect::<Result<_, String>>()?
+            // The first frame that is damaged is named, whichever is decoded first.
+            let decoded: Vec<Result<Vec<u32>, String>> = frames.par_iter().enumerate().map(decode).collect();
+            decoded.into_iter().collect::<Result<_, String>>()?
         }
         Value::Bytes { bytes, .. } if codec == Codec::Native => uncompressed(bytes, element, layout)?,
         _ => return Err("is not compressed, though the transfer syntax says that it is".into()),

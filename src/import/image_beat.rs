@@ -19,11 +19,6 @@ const MIN_LIKENESS: f64 = 0.02;
 /// Share of the highest rise that makes a time the length of a beat; the shortest such time is used, because longer ones are
 /// several beats.
 const AS_GOOD: f64 = 0.8;
-/// Degrees of the slow course that is removed from each pixel, in the order in which they are tried: none, then changes by
-/// contrast that comes in and by breathing.
-const TREND_DEGREES: std::ops::RangeInclusive<usize> = 0..=3;
-/// Minimum length of a run, beats, from which a curved course is removed: in a shorter one, the beat itself looks like a curve.
-const MIN_BEATS_OF_CURVES: f64 = 2.0;
 /// Number of steps of the search for the R-peak within a beat.
 const STEPS: usize = 200;
 /// Iterations of the power method.
@@ -38,8 +33,6 @@ pub struct ImageBeat {
     pub beats_per_min: f64,
     /// Correlation of the vessels' motion with the contraction of a ventricle, -1 to 1.
     pub likeness: f64,
-    /// Degree of the slow course that was removed from each pixel; 0 for its mean alone.
-    pub trend_degree: usize,
 }
 
 /// Finds the beat in images of one view at increasing times, seconds. `vessel_pixels` is half the width of the widest vessel.
@@ -58,15 +51,10 @@ pub fn beat(images: &[&Image], times_s: &[f64], vessel_pixels: usize) -> Result<
         return Err(refused("the times of the images are not equally spaced: give R-peaks or a heart rate".into()));
     }
     let vessels: Vec<Vec<f32>> = images.par_iter().map(|image| vessels(image, vessel_pixels)).collect();
-    let repeats = |degree: usize| {
-        let frames = period(&likeness(&without_trend(&vessels, degree)), frame_s)?;
-        (degree < 2 || n as f64 >= MIN_BEATS_OF_CURVES * frames).then_some((frames, degree))
-    };
-    let (frames, trend_degree) = TREND_DEGREES.into_iter().find_map(repeats).ok_or_else(|| {
+    let frames = period(&likeness(&centred(&vessels, n)), frame_s).ok_or_else(|| {
         refused(format!(
-            "{n} images in {:.1} s do not repeat, as they would in one and a half beats of a regular rhythm, also after \
-             slow changes by contrast and breathing were removed: give R-peaks (--r-peaks), a heart rate (--heart-rate) \
-             or the phases of the frames (--phase-list), or choose other frames (--frames)",
+            "{n} images in {:.1} s do not repeat, as they would in one and a half beats of a regular rhythm without breathing: give \
+             R-peaks, a heart rate or the phases of the frames, or choose other frames",
             times_s[n - 1] - times_s[0]
         ))
     })?;
@@ -77,7 +65,7 @@ pub fn beat(images: &[&Image], times_s: &[f64], vessel_pixels: usize) -> Result<
     let first = times_s[0] + r_peak_s - beat_s;
     let count = ((times_s[n - 1] - first) / beat_s).ceil() as usize + 2;
     let r_peaks = RPeaks::new(&(0..count).map(|k| first + k as f64 * beat_s).collect::<Vec<f64>>())?;
-    Ok(ImageBeat { r_peaks, beats_per_min: 60.0 / beat_s, likeness, trend_degree })
+    Ok(ImageBeat { r_peaks, beats_per_min: 60.0 / beat_s, likeness })
 }
 
 /// Extracts thin structures, such as vessels, on a coarser pixel grid and divides them by their sum, so that the amount of
@@ -112,38 +100,6 @@ fn centred(images: &[Vec<f32>], window: usize) -> Vec<Vec<f32>> {
         out
     };
     (0..n).into_par_iter().map(less_mean).collect()
-}
-
-/// Polynomials of the order of images, orthogonal to each other and of norm 1, up to a degree.
-fn polynomials(n: usize, degree: usize) -> Vec<Vec<f64>> {
-    let mut found: Vec<Vec<f64>> = Vec::new();
-    for power in 0..=degree.min(n.saturating_sub(1)) {
-        let at = |i: usize| (2.0 * i as f64 / (n - 1).max(1) as f64 - 1.0).powi(power as i32);
-        let mut course: Vec<f64> = (0..n).map(at).collect();
-        for other in &found {
-            let share: f64 = course.iter().zip(other).map(|(a, b)| a * b).sum();
-            course.iter_mut().zip(other).for_each(|(a, b)| *a -= share * b);
-        }
-        let norm = course.iter().map(|a| a * a).sum::<f64>().sqrt().max(f64::MIN_POSITIVE);
-        course.iter_mut().for_each(|a| *a /= norm);
-        found.push(course);
-    }
-    found
-}
-
-/// Subtracts from the course of each pixel its best approximation by a polynomial.
-fn without_trend(images: &[Vec<f32>], degree: usize) -> Vec<Vec<f32>> {
-    let mut out = images.to_vec();
-    for course in polynomials(images.len(), degree) {
-        let mut share = vec![0f32; images.first().map_or(0, Vec::len)];
-        for (image, weight) in images.iter().zip(&course) {
-            share.iter_mut().zip(image).for_each(|(sum, v)| *sum += *weight as f32 * v);
-        }
-        for (image, weight) in out.iter_mut().zip(&course) {
-            image.iter_mut().zip(&share).for_each(|(v, sum)| *v -= *weight as f32 * sum);
-        }
-    }
-    out
 }
 
 /// Scalar products of all pairs of images.
@@ -279,28 +235,6 @@ mod tests {
             let none = times.iter().find(|t| found.r_peaks.beat_time(**t, 10, BeatScaling::default()).is_none());
             assert_eq!(none, None, "all images have a phase");
         }
-    }
-
-    #[test]
-    fn the_beat_is_found_below_inflow_and_breath() {
-        // 37 frames in 2.4 s of nearly three beats: contrast runs down the vessels while they drift by more than they beat.
-        let (n, frames_per_s, beat_s) = (37, 15.0, 0.85);
-        let times: Vec<f64> = (0..n).map(|i| f64::from(i) / frames_per_s).collect();
-        let image = |t: &f64| {
-            let squeeze = contraction(two_segment_fraction((t - 0.3).rem_euclid(beat_s), beat_s, SYSTOLE_S));
-            let drift = 5.0 * (0.55 * t).sin();
-            let values = (0..SIZE * SIZE).map(|p| {
-                let (x, y) = ((p % SIZE) as f64, (p / SIZE) as f64);
-                let filled = 1.0 / (1.0 + ((y - 24.0 * t) / 3.0).exp());
-                let vessel = |at: f64, swing: f64| (-(x - at - swing * squeeze - drift).powi(2) / 2.0).exp();
-                (2.0 + (0.3 + filled) * (vessel(10.0, 3.0) + vessel(30.0, -2.0))) as f32
-            });
-            Image { width: SIZE, height: SIZE, values: values.collect() }
-        };
-        let images: Vec<Image> = times.iter().map(image).collect();
-        let found = beat(&images.iter().collect::<Vec<_>>(), &times, 3).unwrap();
-        assert!((found.beats_per_min * beat_s / 60.0 - 1.0).abs() < 0.06, "{found:?}");
-        assert!(found.trend_degree > 0, "{found:?}");
     }
 
     #[test]

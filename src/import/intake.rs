@@ -5,7 +5,7 @@ use crate::geometry::{Geometry, MM_PER_UNIT};
 use crate::import::angiograms::{Gating, ImportOptions, Prepared, TakenFrame};
 use crate::import::dicom::Run;
 use crate::import::pictures::{self, PictureView, PixelMeaning};
-use crate::import::stated::{StatedGeometry, StatedRun};
+use crate::import::stated::StatedGeometry;
 use crate::scan::at_rest;
 use crate::scan::canvas::in_words;
 use crate::scan::dataset::{Layout, Split};
@@ -42,6 +42,15 @@ impl AcceptedRun {
             angles_deg: [first.primary_deg, first.secondary_deg],
         }
     }
+}
+
+/// Properties of a run as the user states them.
+#[derive(Debug, Clone, Default)]
+pub struct StatedRun {
+    /// Its geometry.
+    pub geometry: StatedGeometry,
+    /// Source of its phases, in place of that of all runs.
+    pub gating: Option<Gating>,
 }
 
 /// Runs that were accepted, with the options of their import.
@@ -120,7 +129,9 @@ impl Intake {
             Some(gating) => Prepared::new(run, &ImportOptions { gating, ..options.clone() }),
             None => Prepared::new(run, options),
         };
-        let prepared = runs.par_iter().enumerate().map(prepare).collect::<Result<Vec<_>>>()?;
+        // The first run that is refused is named, whichever is prepared first.
+        let prepared: Vec<Result<Prepared>> = runs.par_iter().enumerate().map(prepare).collect();
+        let prepared = prepared.into_iter().collect::<Result<Vec<_>>>()?;
         runs.iter().zip(&prepared).try_for_each(|(run, prepared)| trainable(run, prepared, options))?;
         notes.extend(prepared.iter().flat_map(|prepared| prepared.notes.iter().cloned()));
         self.taken = taken;

@@ -1,6 +1,4 @@
-//! Properties of a single run that the user states, in place of what its file says or does not say.
-
-use crate::import::angiograms::Gating;
+//! Geometry of a single run that the user states, in place of what its file says or does not say.
 
 /// Geometry of a run as the user states it; it takes precedence over the file.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -13,13 +11,4 @@ pub struct StatedGeometry {
     pub angles_deg: Option<[f64; 2]>,
     /// Pixel pitch on the detector along columns and rows, mm.
     pub pixel_mm: Option<[f64; 2]>,
-}
-
-/// Properties of a run as the user states them.
-#[derive(Debug, Clone, Default)]
-pub struct StatedRun {
-    /// Its geometry.
-    pub geometry: StatedGeometry,
-    /// Source of its phases, in place of that of all runs.
-    pub gating: Option<Gating>,
 }

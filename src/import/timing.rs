@@ -13,7 +13,7 @@ const USUAL_RATE_HZ: f64 = 15.0;
 /// RecommendedDisplayFrameRate stand in.
 ///
 /// # Errors
-/// [`crate::Error::Data`] naming the element.
+/// [`crate::error::Error::Data`] naming the element.
 pub(super) fn times(run: &Reader<'_>, n: usize, notes: &mut Vec<String>) -> Result<Vec<f64>> {
     if n == 1 {
         return Ok(vec![0.0]);

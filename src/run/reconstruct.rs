@@ -80,7 +80,7 @@ pub fn reconstruct(
         Trainer::resume(gpu, plan, dataset, options.tuning.clone(), &saved)?
     } else {
         // What is wrong with the views is often the reason why there is nothing to plan.
-        let plan = Plan::new(config, dataset).inspect_err(|_| checked.iter().for_each(|event| observe(event)))?;
+        let plan = Plan::new(config, dataset).inspect_err(|_| checked.iter().for_each(&mut *observe))?;
         if let Some(hull) = &plan.hull {
             hull_pictures::write(&options.run.join("report"), dataset, hull)?;
         }

@@ -61,6 +61,7 @@ impl Golden {
             width,
             height,
             n_phases: phases,
+            still: false,
             depth_range: (-self.number("depth"), self.number("depth")),
             hidden: Default::default(),
             vessel_attenuation: None,

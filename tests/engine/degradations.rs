@@ -584,6 +584,7 @@ fn volumes_are_degraded_like_phantoms() {
         c_arms: c_arms(),
         size: SIZE,
         views: views(),
+        still: false,
         seed: 5,
         degradations,
         layout: Layout::Native,

@@ -23,6 +23,7 @@ fn trained(gpu: &Gpu, dataset: &Dataset) -> Arc<Session> {
         depth_half_extent_mm: 100.0,
         vessel_attenuation_per_mm: Some(0.01),
         deterministic: true,
+        still: false,
     };
     let session = Session::new(Some(gpu.clone()), Some(tuning(gpu)), options).unwrap();
     for frame in dataset.training() {

@@ -5,6 +5,7 @@
 use crate::parsers::{MAX_ALLOCATION_BYTES, PARSERS, Parser, scratch};
 use nertca_vk::import::ecg;
 use std::alloc::{GlobalAlloc, Layout, System};
+use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
@@ -115,15 +116,18 @@ fn damage(seed: &[u8], random: &mut Random) -> Vec<u8> {
 
 /// Passes damaged copies of its seeds to a parser.
 fn feed(parser: &Parser) {
+    feed_files(parser.name, parser.file, &(parser.seeds)(), parser.parse);
+}
+
+/// Passes damaged copies of `seeds`, as a file called `file`, to a parser.
+fn feed_files(name: &str, file: &str, seeds: &[Vec<u8>], parse: fn(&Path) -> bool) {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
-    let Parser { name, file, parse, .. } = parser;
-    let seeds = (parser.seeds)();
     let number = |variable| std::env::var(variable).ok().map(|n| n.parse::<u64>().unwrap());
     let count = number("NERTCA_MALFORMED_INPUTS").unwrap_or(3000);
     let only = number("NERTCA_MALFORMED_SEED");
     let dir = scratch();
     let path = dir.path().join(file);
-    for seed in &seeds {
+    for seed in seeds {
         std::fs::write(&path, seed).unwrap();
         assert!(parse(&path), "{name}: the undamaged file is refused");
     }
@@ -245,13 +249,13 @@ write('unknown', before_pixels(element(0x21, 0x1010, b'UN', item(implicit(0x21, 
     );
     let seeds: Vec<Vec<u8>> = files.names().iter().map(|name| std::fs::read(files.path(name)).unwrap()).collect();
     assert_eq!(seeds.len(), 5);
-    feed("c.dcm", &seeds, |p| nertca_vk::import::dicom::Run::read(p, None).is_ok());
+    feed_files("dicom, compressed", "c.dcm", &seeds, |p| nertca_vk::import::dicom::Run::read(p, None).is_ok());
 }
 
 #[test]
 fn ecg_traces() {
     let seeds = || vec![(0..400).map(|i| if i % 80 < 3 { 250 } else { (i % 7) as u8 }).collect()];
-    let parse = |path: &std::path::Path| {
+    let parse = |path: &Path| {
         let trace: Vec<f64> = std::fs::read(path).unwrap().iter().map(|b| f64::from(*b)).collect();
         ecg::r_peaks(&trace, 100.0).is_ok()
     };

@@ -7,7 +7,8 @@ use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use nertca_vk::import::angiograms::{Gating, ImportOptions};
-use nertca_vk::import::stated::{StatedGeometry, StatedRun};
+use nertca_vk::import::intake::StatedRun;
+use nertca_vk::import::stated::StatedGeometry;
 use nertca_vk::scan::gating::{BeatScaling, RPeaks};
 use std::path::{Path, PathBuf};
 

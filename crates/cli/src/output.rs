@@ -199,7 +199,7 @@ impl Earlier {
     /// [`Error::Io`].
     pub fn make_way(self, made: &[PathBuf]) -> Result<()> {
         let names: Vec<_> = made.iter().filter_map(|path| path.file_name()).collect();
-        let old = self.0.iter().filter(|path| !path.file_name().is_some_and(|name| names.contains(&name)));
-        old.into_iter().try_for_each(|path| std::fs::remove_file(path).map_err(Error::io("remove", path)))
+        let mut old = self.0.iter().filter(|path| !path.file_name().is_some_and(|name| names.contains(&name)));
+        old.try_for_each(|path| std::fs::remove_file(path).map_err(Error::io("remove", path)))
     }
 }
