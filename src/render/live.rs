@@ -269,7 +269,9 @@ impl Live {
     /// Device errors.
     pub fn bake_like(&self, earlier: &Live, step: u32) -> Result<()> {
         let before = earlier.freshness().volumes.clone();
-        for (slot, age) in before.iter().enumerate().take(self.freshness().volumes.len()) {
+        // The lock must be free again before volumes are baked.
+        let n_volumes = self.freshness().volumes.len();
+        for (slot, age) in before.iter().enumerate().take(n_volumes) {
             if age.shown.is_some_and(|shown| shown.elapsed() < SHOWN_LATELY) {
                 self.bake_beside(slot, step)?;
                 self.freshness().volumes[slot].shown = age.shown;
