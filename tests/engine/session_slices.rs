@@ -67,6 +67,22 @@ fn with_pictures<T>(session: &Arc<Session>, dataset: &Dataset, work: impl FnOnce
 }
 
 #[test]
+fn training_goes_on_with_new_frames_after_a_picture() {
+    let gpu = gpu();
+    let dataset = small_dataset(16, 16);
+    let session = trained(&gpu, &dataset);
+    let (rays, size) = (&dataset.views[0].rays, (dataset.width, dataset.height));
+    let before = session.render(rays, size, 1u32, SHOWN).unwrap();
+    let again = session.frame_status(0).unwrap();
+    session.set_geometry(0, dataset.views[again.view].geometry.clone()).unwrap();
+    // What the picture showed is prepared from the new field, in this thread, before training goes on.
+    session.train(20, &mut |_| true).unwrap();
+    assert_eq!(session.render(rays, size, 1u32, SHOWN).unwrap().len(), before.len());
+    drop(session);
+    expect_silence(gpu);
+}
+
+#[test]
 fn live_pictures_pass_while_long_work_goes_on() {
     let gpu = gpu();
     let dataset = small_dataset(16, 16);
