@@ -32,7 +32,7 @@ pub struct PairAgreement {
     /// Squared difference of their profiles, as a share of their squares: 0 for one object, about 1 for two unrelated ones.
     pub residual: f64,
     /// Share of the squares of their profiles that varies over the phases. Vessels that move within the planes through both
-    /// sources change nothing in the profiles, whose difference then says nothing.
+    /// sources change nothing in the profiles, whose difference is then no evidence.
     pub varies: f64,
     /// Whether the verdict rests on the pair.
     pub judged: bool,

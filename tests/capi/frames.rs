@@ -84,7 +84,7 @@ fn frames_whose_angles_have_noise_are_one_view() {
         assert!(bytes_of(noisy) == bytes_of(steady), "all frames of a view have the geometry of its first one");
         ok(unsafe { nertca_reconstruction_destroy(noisy) }, noisy);
     }
-    // Far apart, each frame is a view of its own, and the reason is told.
+    // Far apart, each frame is a view of its own, and the message states the reason.
     let moving = reconstruction(context, SMALL);
     add_noisy_frames(moving, 10.0);
     let status = unsafe { nertca_reconstruction_train(moving, 1, None, null_mut(), null_mut()) };

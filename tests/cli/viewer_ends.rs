@@ -46,11 +46,11 @@ fn half_sent_requests_hold_up_neither_the_end_nor_other_clients() {
     let mut slow: Vec<TcpStream> = (0..80).map(|_| half_a_request(port)).collect();
     let mut rest = Vec::new();
     slow[0].read_to_end(&mut rest).expect("a client that sends no more is closed");
-    let mut asks = TcpStream::connect(("127.0.0.1", port)).unwrap();
-    asks.set_read_timeout(Some(LIMIT)).unwrap();
-    asks.write_all(b"GET /info HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n").unwrap();
+    let mut client = TcpStream::connect(("127.0.0.1", port)).unwrap();
+    client.set_read_timeout(Some(LIMIT)).unwrap();
+    client.write_all(b"GET /info HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n").unwrap();
     let mut answer = String::new();
-    asks.read_to_string(&mut answer).unwrap();
+    client.read_to_string(&mut answer).unwrap();
     assert!(answer.starts_with("HTTP/1.1 403"), "{answer}");
     let again = half_a_request(port);
     let interrupted = std::process::Command::new("kill").args(["-INT", &server.id().to_string()]).status().unwrap();

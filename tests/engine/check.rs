@@ -278,7 +278,7 @@ fn vessels_that_stay_longer_than_they_are_away_are_not_inverted() {
             few.frames.iter_mut().flat_map(|f| &mut f.integrals).for_each(|v| *v = scale * *v + offset);
             let found = told(&few);
             assert!(found.mistakes.is_empty() && !found.faulty(), "{moments:?}, {scale}: {found:?}");
-            // The same images as intensities are told; where their range is small, both mistakes explain them.
+            // The same images as intensities are reported; where their range is small, both mistakes explain them.
             few.frames.iter_mut().flat_map(|f| &mut f.integrals).for_each(|v| *v = 4000.0 * (-*v).exp());
             let found = told(&few);
             let named = found.mistakes.iter().any(|m| m.contains("are intensities") || scale < 1.0);

@@ -52,7 +52,7 @@ fn the_pointer_decides_which_frame_time_holds() {
     assert_eq!(times(time, ["80", "0\\10\\20\\30\\40\\50", "-", "-"]).0, steady(80.0));
     assert_eq!(times(vector, ["80", "0\\10\\20\\30\\40\\50", "-", "-"]).0, listed);
     assert_eq!(times(None, ["80", "0\\10\\20\\30\\40\\50", "-", "-"]).0, listed);
-    // A vector of one value says nothing, and is named where it is passed over.
+    // A vector of one value holds no times, and a note names it where it is not used.
     assert_eq!(times(time, ["80", "0", "-", "-"]), (steady(80.0), String::new()));
     let (found, told) = times(None, ["80", "0", "-", "-"]);
     assert!(found == steady(80.0) && told.contains("FrameTimeVector has 1 values for 6 frames"), "{told}");

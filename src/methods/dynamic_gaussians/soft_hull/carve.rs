@@ -16,7 +16,7 @@ const KEEP_FOUR_VIEWS: f32 = 9.5;
 /// Minimum sum per view of a kept cell that fewer views see; the largest possible is 4.5.
 const KEEP_PER_VIEW: f32 = 7.0 / 3.0;
 /// Number of phases of a beat from which a vessel moves no further than to a neighbouring coarse cell from one phase to the next.
-/// With fewer, a vessel that is not there at the phase before or after says nothing against it.
+/// With fewer, a vessel that is not there at the phase before or after is no evidence against it.
 const TRACEABLE_PHASES: usize = 4;
 /// Lower limit of the neighbours' evidence, in units of a single view's strongest evidence against a cell.
 const MIN_SUPPORT: f32 = 2.5;
