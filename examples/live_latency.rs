@@ -14,6 +14,7 @@ use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::model::component::Component;
 use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::scan::dataset::{Dataset, Frame};
+use nertca_vk::score::metrics::best_dice;
 use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions};
 use std::path::Path;
 use std::sync::Arc;
@@ -70,8 +71,9 @@ fn main() -> Result<()> {
     let while_frames_arrive = watch(&draw, &mut || pushed.load(Ordering::Acquire) < all)?;
     let last_frame = pushing.join().unwrap_or_else(|_| Err(Error::Internal("a thread panicked".into())))?;
     let while_training = watch(&draw, &mut || {
-        if session.drawn().is_some_and(|drawn| drawn.frames == all) {
-            with_all.get_or_insert_with(Instant::now);
+        if with_all.is_none() && session.drawn().is_some_and(|drawn| drawn.frames == all) {
+            let seen_at = Instant::now();
+            with_all = Some((seen_at, picture_dice(&session, &dataset)));
         }
         !session.wait(Duration::ZERO)
     })?;
@@ -91,8 +93,12 @@ fn main() -> Result<()> {
     {
         println!("{name:>14}: {watched}");
     }
-    if let Some(with_all) = with_all {
-        println!("first picture of all {all} frames: {:.2} s after the last", (with_all - last_frame).as_secs_f64());
+    if let Some((seen_at, dice)) = with_all {
+        println!(
+            "first picture of all {all} frames: {:.2} s after the last; best Dice of its vessels: {:.3}",
+            (seen_at - last_frame).as_secs_f64(),
+            dice?
+        );
     }
     println!("Dice of the dynamic field: {:?}; {:?}", evaluation.dice.dynamic, session.state());
     Ok(())
@@ -109,6 +115,20 @@ fn new_frame(dataset: &Dataset, frame: &Frame) -> NewFrame {
         integrals: own.integrals,
         mask: own.mask,
     }
+}
+
+/// Dice of live pictures of the dynamic field at the unseen views of phase 0, at the best threshold of all.
+fn picture_dice(session: &Session, dataset: &Dataset) -> Result<f64> {
+    let vessels = Quantity { component: Component::Dynamic, projection: Projection::Drr };
+    let frames = dataset.validation().iter().filter(|frame| frame.phase == 0);
+    let scored = frames.filter_map(|frame| frame.mask.as_deref().map(|mask| (frame, mask)));
+    let draw = |(frame, mask): (&Frame, _)| {
+        let view = &dataset.views[frame.view];
+        Ok((session.render(&view.rays, (view.size[0], view.size[1]), 0, vessels)?, mask))
+    };
+    let drawn = scored.map(draw).collect::<Result<Vec<_>>>()?;
+    let images: Vec<(&[f32], &[bool])> = drawn.iter().map(|(image, mask)| (image.as_slice(), *mask)).collect();
+    Ok(best_dice(&images, 0.0).map_or(f64::NAN, |(dice, _)| dice))
 }
 
 /// Rays of a view that no frame was taken from, on a square of `side` pixels.

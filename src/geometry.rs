@@ -272,6 +272,16 @@ impl ViewRays {
         ViewRays::at_depth(self.source(), [first, self.direction[1] * f, self.direction[2] * f], self.sod)
     }
 
+    /// Returns the rays of an image whose first row is row `first` of this one.
+    pub fn from_row(&self, first: usize) -> ViewRays {
+        let (anchor, direction) = self.pixel(0.0, first as f64);
+        ViewRays {
+            anchor: [anchor, self.anchor[1], self.anchor[2]],
+            direction: [direction, self.direction[1], self.direction[2]],
+            sod: self.sod,
+        }
+    }
+
     /// Anchor and direction of pixel `(i, j)`.
     pub fn pixel(&self, i: f64, j: f64) -> (DVec3, DVec3) {
         let at = |p: &[DVec3; 3]| p[0] + i * p[1] + j * p[2];

@@ -191,6 +191,7 @@ pub mod plan;
 pub mod render {
     pub mod baked;
     pub mod grid;
+    mod kept_images;
     pub mod live;
     pub mod quantity;
     pub mod renderer;

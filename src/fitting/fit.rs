@@ -112,6 +112,8 @@ impl FitField {
 pub struct FieldFeed {
     /// Parameters of the fields that rays are marched through, on the device.
     pub params: Option<Buffer>,
+    /// Iteration up to which `params` do not change, because another part of the field is fitted first.
+    pub params_fixed_until: u32,
     /// Gaussians, on the host.
     pub gaussians: Option<GaussianFeed>,
     /// Parameters on the device of a field that its method draws itself.

@@ -12,12 +12,14 @@ use crate::kernels::push;
 use crate::model::Model;
 use crate::model::component::Component;
 use crate::render::grid::Grid;
+use crate::render::kept_images::{ImageKey, KeptImages};
 use crate::render::quantity::{Projection, Quantity};
 use crate::render::renderer::Renderer;
 use glam::Vec3;
 use half::f16;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 /// Cells of a baked volume along its longest side.
 pub const BAKED_CELLS: u32 = 192;
@@ -35,12 +37,17 @@ pub struct Baked {
     volumes: Mutex<Vec<Option<Image3d>>>,
     /// Recorded commands by size, phase and quantity: a frame only writes a view, submits, and reads a picture.
     recorded: Mutex<HashMap<RecordedKey, Arc<RecordedView>>>,
+    /// Images of the static field, behind Gaussians.
+    static_images: KeptImages,
 }
 
 /// Maximum number of recorded frames kept; a viewer in use has far fewer.
 const MAX_RECORDED: usize = 256;
 /// Pixels of recorded frames beyond which they are discarded: 64 MiB on the device.
 const MAX_RECORDED_PIXELS: usize = 1 << 24;
+
+/// Maximum number of pixels of a strip that is drawn beside other pictures: a CPU takes about 10 ms for it.
+const STRIP_PIXELS: usize = 1 << 14;
 
 /// Columns, rows, phase, quantity.
 type RecordedKey = (usize, usize, u32, Quantity);
@@ -96,7 +103,14 @@ impl Baked {
         let static_grid = Grid::over(corner(s.static_min), corner(s.static_max), static_cells);
         let dynamic_grid = Grid::over(corner(s.dynamic_min), corner(s.dynamic_max), dynamic_cells);
         let volumes = Mutex::new(vec![None; 1 + s.n_phases as usize]);
-        Baked { static_grid, dynamic_grid, volumes, renderer, recorded: Mutex::default() }
+        Baked {
+            static_grid,
+            dynamic_grid,
+            volumes,
+            renderer,
+            recorded: Mutex::default(),
+            static_images: KeptImages::default(),
+        }
     }
 
     /// Renderer whose fields are baked.
@@ -115,6 +129,9 @@ impl Baked {
     }
 
     fn bake_field(&self, field: Component, phase: u32) -> Result<Commands> {
+        if field == Component::Static {
+            self.static_images.clear();
+        }
         self.fill(field, phase, &self.cells(field, phase)?)
     }
 
@@ -134,7 +151,8 @@ impl Baked {
     }
 
     /// Fills the volume of a single field with cells that [`Baked::cells`] returned. The copy may still be under way, as after
-    /// [`Baked::bake`]. No picture may be under way.
+    /// [`Baked::bake`]. No picture may be under way. Pictures show kept images of the earlier static field until
+    /// [`Baked::redraw_static_images`].
     ///
     /// # Errors
     /// [`Error::OutOfMemory`]; other device errors.
@@ -204,8 +222,42 @@ impl Baked {
         let of = |component| Quantity { component, ..quantity };
         let mut image = self.renderer.show(rays, (width, height), phase, of(Component::Dynamic))?;
         if quantity.component.has_static() {
-            let static_image = self.render(rays, width, height, phase, of(Component::Static))?;
-            image.iter_mut().zip(&static_image).for_each(|(sum, static_image)| *sum += static_image);
+            let static_image = self.static_image(rays, (width, height), quantity.projection)?;
+            image.iter_mut().zip(&*static_image).for_each(|(sum, static_image)| *sum += static_image);
+        }
+        Ok(image)
+    }
+
+    /// Returns an image of the static field alone, rows first.
+    ///
+    /// # Errors
+    /// As [`Baked::render`].
+    pub fn static_image(&self, rays: &ViewRays, size: (usize, usize), projection: Projection) -> Result<Arc<Vec<f32>>> {
+        let quantity = Quantity { component: Component::Static, projection };
+        let key = ImageKey { rays: rays.clone(), size, projection };
+        self.static_images.get(key, || self.render(rays, size.0, size.1, 0, quantity))
+    }
+
+    /// Draws the kept images of the static field anew that `earlier` showed within the last `lately`, beside pictures that are drawn in
+    /// other threads; `earlier` may be this.
+    ///
+    /// # Errors
+    /// As [`Baked::render`].
+    pub(super) fn redraw_static_images(&self, earlier: &Baked, lately: Duration) -> Result<()> {
+        let shown = earlier.static_images.shown_lately(lately);
+        self.static_images.redraw(shown, |key| self.draw_in_strips(key))
+    }
+
+    /// Renders the static field in strips of rows, between which other pictures pass.
+    fn draw_in_strips(&self, key: &ImageKey) -> Result<Vec<f32>> {
+        let (width, height) = key.size;
+        let quantity = Quantity { component: Component::Static, projection: key.projection };
+        let rows = (STRIP_PIXELS / width.max(1)).clamp(1, height.max(1));
+        let mut image = Vec::with_capacity(width * height);
+        for first in (0..height).step_by(rows) {
+            self.renderer.pause()?;
+            let strip = key.rays.from_row(first);
+            image.extend(self.render(&strip, width, rows.min(height - first), 0, quantity)?);
         }
         Ok(image)
     }
@@ -233,7 +285,7 @@ impl Baked {
         Ok(self.renderer.gpu.wait(commands.submit()?)?)
     }
 
-    /// Draws [`Baked::render_gaussians`] into a buffer. Only maxima along rays come by way of the host.
+    /// Draws [`Baked::render_gaussians`] into a buffer. Maxima along rays and kept images of the static field come by way of the host.
     fn render_gaussians_into(
         &self,
         target: &Buffer,
@@ -248,7 +300,8 @@ impl Baked {
         }
         let has_static = quantity.component.has_static();
         if has_static {
-            self.render_into(target, rays, size, phase, Quantity { component: Component::Static, ..quantity })?;
+            let image = self.static_image(rays, size, quantity.projection)?;
+            self.renderer.gpu.upload(target, 0, &image)?;
         }
         self.renderer.show_gaussians_into(target, rays, size, phase, has_static)
     }

@@ -26,6 +26,9 @@ const REST: u32 = 4;
 /// Time after a picture during which the volumes that it showed are kept up to date.
 const SHOWN_LATELY: Duration = Duration::from_secs(1);
 
+/// Index of the static field among the volumes; those of the phases follow.
+const STATIC_SLOT: usize = 0;
+
 /// Data of a run in training that a view needs.
 #[derive(Clone)]
 pub struct Source {
@@ -58,6 +61,8 @@ pub struct Live {
     config: Config,
     scene: Scene,
     params: Option<Buffer>,
+    /// Iteration up to which `params` do not change.
+    params_fixed_until: u32,
     gaussians: Option<GaussianFeed>,
     /// Count of the feed's changes at the field that is drawn.
     gaussians_at: AtomicU64,
@@ -80,9 +85,13 @@ struct VolumeAge {
     shown: Option<Instant>,
 }
 
+fn was_shown_lately(age: &VolumeAge) -> bool {
+    age.shown.is_some_and(|shown| shown.elapsed() < SHOWN_LATELY)
+}
+
 /// Field and phase of a volume.
 fn volume(slot: usize) -> (Component, u32) {
-    if slot == 0 { (Component::Static, 0) } else { (Component::Dynamic, slot as u32 - 1) }
+    if slot == STATIC_SLOT { (Component::Static, 0) } else { (Component::Dynamic, slot as u32 - 1) }
 }
 
 impl Live {
@@ -107,6 +116,7 @@ impl Live {
             config: model.config.clone(),
             scene: model.scene.clone(),
             params: source.feed.params.clone(),
+            params_fixed_until: source.feed.params_fixed_until,
             gaussians: source.feed.gaussians.clone(),
             gaussians_at: AtomicU64::new(u64::MAX),
             drawing: Mutex::default(),
@@ -169,8 +179,8 @@ impl Live {
             ));
         };
         if quantity.component.has_static() {
-            let behind = self.baked.render(rays, size.0, size.1, 0, of(Component::Static))?;
-            image.iter_mut().zip(&behind).for_each(|(sum, behind)| *sum += behind);
+            let behind = self.baked.static_image(rays, size, quantity.projection)?;
+            image.iter_mut().zip(&*behind).for_each(|(sum, behind)| *sum += behind);
         }
         Ok(image)
     }
@@ -207,7 +217,7 @@ impl Live {
     fn shown_volumes(&self, phase: u32, quantity: Quantity) -> Vec<usize> {
         let component = quantity.component;
         let dynamic = component.has_dynamic() && !self.baked.renderer().draws_gaussians(quantity);
-        let slots = [(component.has_static(), 0), (dynamic, 1 + phase as usize)];
+        let slots = [(component.has_static(), STATIC_SLOT), (dynamic, 1 + phase as usize)];
         slots.into_iter().filter(|(shown, _)| *shown).map(|(_, slot)| slot).collect()
     }
 
@@ -215,7 +225,17 @@ impl Live {
     pub fn shown_step(&self, step: u32, phase: f64, quantity: Quantity) -> u32 {
         let freshness = self.freshness();
         let volumes = self.shown_volumes(phase as u32, quantity).into_iter();
-        volumes.filter_map(|slot| freshness.volumes[slot].baked_at).fold(step, u32::min)
+        let oldest = |oldest: u32, slot: usize| match freshness.volumes[slot].baked_at {
+            Some(baked_at) if self.is_stale(slot, baked_at, step) => oldest.min(baked_at),
+            _ => oldest,
+        };
+        volumes.fold(step, oldest)
+    }
+
+    /// Tells whether the field of a volume that was baked at an iteration is another one at `step`.
+    fn is_stale(&self, slot: usize, baked_at: u32, step: u32) -> bool {
+        let fixed = volume(slot).0 == Component::Static && baked_at.max(step) <= self.params_fixed_until;
+        baked_at != step && !fixed
     }
 
     fn refresh(&self, step: u32, refresh: Refresh, phase: u32, quantity: Quantity) -> Result<Vec<Commands>> {
@@ -227,7 +247,7 @@ impl Live {
                 let mut freshness = self.freshness();
                 let age = &mut freshness.volumes[slot];
                 age.shown = Some(begin);
-                age.baked_at.is_none_or(|baked_at| baked_at != step && refresh == Refresh::Now)
+                age.baked_at.is_none_or(|baked_at| refresh == Refresh::Now && self.is_stale(slot, baked_at, step))
             };
             if bakes {
                 let (field, phase) = volume(slot);
@@ -253,14 +273,41 @@ impl Live {
     pub fn refresh_beside(&self, step: u32) -> Result<()> {
         let stale = {
             let freshness = self.freshness();
-            let lately = |age: &VolumeAge| age.shown.is_some_and(|shown| shown.elapsed() < SHOWN_LATELY);
-            let stale = |age: &VolumeAge| age.baked_at.is_some_and(|baked_at| baked_at != step) && lately(age);
+            let stale = |slot: &usize| {
+                let age = &freshness.volumes[*slot];
+                age.baked_at.is_some_and(|baked_at| self.is_stale(*slot, baked_at, step)) && was_shown_lately(age)
+            };
             let rests = Instant::now() < freshness.rest_until;
             // The oldest first, so that each has its turn.
             let of_age = |slot: &usize| freshness.volumes[*slot].baked_at;
-            (0..freshness.volumes.len()).filter(|slot| !rests && stale(&freshness.volumes[*slot])).min_by_key(of_age)
+            (0..freshness.volumes.len()).filter(|slot| !rests && stale(slot)).min_by_key(of_age)
         };
-        stale.map_or(Ok(()), |slot| self.bake_beside(slot, step))
+        stale.map_or(Ok(()), |slot| self.bake_beside(slot, step, self))
+    }
+
+    /// Bakes all volumes anew that pictures showed lately and that are older than `step`, as [`Live::refresh_beside`] does one after
+    /// the other.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn refresh_all_beside(&self, step: u32) -> Result<()> {
+        let n_volumes = self.freshness().volumes.len();
+        for slot in 0..n_volumes {
+            let age = self.freshness().volumes[slot];
+            let stale = age.baked_at.is_some_and(|baked_at| self.is_stale(slot, baked_at, step));
+            if stale && was_shown_lately(&age) {
+                self.bake_beside(slot, step, self)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Bakes the static field at `step`, before any picture is drawn: pictures of Gaussians show it.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn bake_static_field(&self, step: u32) -> Result<()> {
+        self.bake_beside(STATIC_SLOT, step, self)
     }
 
     /// Bakes, at `step`, the volumes that pictures of `earlier` showed, before this takes its place.
@@ -272,22 +319,26 @@ impl Live {
         // The lock must be free again before volumes are baked.
         let n_volumes = self.freshness().volumes.len();
         for (slot, age) in before.iter().enumerate().take(n_volumes) {
-            if age.shown.is_some_and(|shown| shown.elapsed() < SHOWN_LATELY) {
-                self.bake_beside(slot, step)?;
+            if was_shown_lately(age) {
+                self.bake_beside(slot, step, earlier)?;
                 self.freshness().volumes[slot].shown = age.shown;
             }
         }
         Ok(())
     }
 
-    fn bake_beside(&self, slot: usize, step: u32) -> Result<()> {
+    /// Bakes a volume anew, and draws the images of it that `earlier` showed.
+    fn bake_beside(&self, slot: usize, step: u32, earlier: &Live) -> Result<()> {
         let (begin, (field, phase)) = (Instant::now(), volume(slot));
-        let followed = if slot == 0 { self.follow_params(step)? } else { self.follow(step)? };
+        let followed = if slot == STATIC_SLOT { self.follow_params(step)? } else { self.follow(step)? };
         let cells = self.baked.cells(field, phase)?;
         drop(followed);
         {
             let _alone = self.alone();
             drop(self.baked.fill(field, phase, &cells)?);
+        }
+        if field == Component::Static {
+            self.baked.redraw_static_images(&earlier.baked, SHOWN_LATELY)?;
         }
         self.note_baked(slot, step, begin);
         Ok(())

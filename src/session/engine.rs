@@ -27,7 +27,7 @@ use std::time::{Duration, Instant};
 /// Pause after taking in new frames, as a multiple of the time that took.
 const SETTLE: u32 = 4;
 /// Shortest time without a new frame that ends the pause early.
-const QUIET: Duration = Duration::from_millis(300);
+const QUIET: Duration = Duration::from_millis(200);
 /// Number of intervals between the last frames without a new one after which a run counts as over.
 const MISSED_FRAMES: u32 = 3;
 /// Interval at which training looks again while others wait for the engine.
@@ -173,14 +173,29 @@ impl Shared {
     }
 
     /// Shows another source from now on, whose field was fitted to `frames` frames; none for as many as that shown so far.
-    pub(super) fn publish(&self, source: Source, frames: Option<u32>) {
-        {
+    /// Returns the generation of the source.
+    pub(super) fn publish(&self, source: Source, frames: Option<u32>) -> u64 {
+        let generation = {
             let mut published = lock(&self.published);
             published.generation += 1;
             published.source = Some(source);
             published.frames = frames.unwrap_or(published.frames);
-        }
+            published.generation
+        };
         self.free_fields();
+        generation
+    }
+
+    /// Prepares to draw the first source before it is published, where pictures are requested already: the first picture then does
+    /// not take much longer than others.
+    fn first_viewer(&self, source: &Source, step: u32) -> Result<Option<Arc<Live>>> {
+        let (gpu, _) = self.device()?;
+        if !gpu.looks().are_recent() || lock(&self.published).source.is_some() {
+            return Ok(None);
+        }
+        let live = self.live(source)?;
+        live.bake_static_field(step)?;
+        Ok(Some(Arc::new(live)))
     }
 
     /// Frees the memory of the renderer of long work, unless it is in use.
@@ -249,6 +264,17 @@ impl Shared {
             // The next picture prepares anew, with the memory of the old viewer, and tells its error.
             *lock(&self.viewer) = None;
         }
+    }
+
+    /// Brings what live pictures show up to the present iteration; pictures do so themselves from now on.
+    fn stop_renewing(&self) {
+        if self.renews.load(Ordering::Acquire) {
+            self.renew_viewer();
+            let viewer = lock(&self.viewer).clone();
+            // The next picture repeats what fails here, and tells its error.
+            let _ = viewer.map(|viewer| viewer.live.refresh_all_beside(self.step.load(Ordering::Acquire)));
+        }
+        self.renews.store(false, Ordering::Release);
     }
 
     fn try_renew(&self, viewer: &Viewer) -> Result<()> {
@@ -356,7 +382,12 @@ impl Shared {
         engine.settling = Some(Settling { until: Instant::now() + took * SETTLE, quiet: took.max(QUIET) });
         self.step.store(trainer.step(), Ordering::Release);
         let shown = (!trainer.shows_earlier()).then_some(engine.frames);
-        self.publish(Source { outline: trainer.outline(), feed: trainer.feed() }, shown);
+        let source = Source { outline: trainer.outline(), feed: trainer.feed() };
+        let first = self.first_viewer(&source, trainer.step())?;
+        let generation = self.publish(source, shown);
+        if let Some(live) = first {
+            *lock(&self.viewer) = Some(Viewer { generation, frames: engine.frames, live });
+        }
         engine.training = Some(Training::new(trainer));
         Ok(())
     }
@@ -441,7 +472,7 @@ impl Shared {
     /// Runs training in the background.
     pub(super) fn work(&self, observe: &mut Observer<'_>) -> Result<State> {
         let ended = self.work_until_end(observe);
-        self.renews.store(false, Ordering::Release);
+        self.stop_renewing();
         ended
     }
 
@@ -454,7 +485,7 @@ impl Shared {
             }
             if self.pause.load(Ordering::Acquire) {
                 self.drain(&mut lock(&self.engine))?;
-                self.renews.store(false, Ordering::Release);
+                self.stop_renewing();
                 self.set_state(State::Paused);
                 self.rest(Duration::from_secs(1), || self.pause.load(Ordering::Acquire));
                 lock(&self.engine).start_clock();
@@ -503,7 +534,7 @@ impl Shared {
 
     /// Waits until the frames are no longer those of `version`.
     fn wait_for_frames(&self, version: u64) {
-        self.renews.store(false, Ordering::Release);
+        self.stop_renewing();
         {
             let mut control = lock(&self.control);
             (control.state, control.waits_at) = (State::Waiting, version);

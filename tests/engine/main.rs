@@ -25,6 +25,7 @@ mod hull;
 mod image_sizes;
 mod kept_pipelines;
 mod kernels_vs_cpu;
+mod live_pictures;
 mod networks;
 mod projector;
 mod refits;

@@ -166,13 +166,18 @@ fn what_was_there_is_shown_until_there_is_better() {
     let mut trainer = Trainer::start_over(&gpu, plan, &dataset, tuning(&gpu), Some(&earlier)).unwrap();
     let feed = trainer.feed().gaussians.unwrap();
     let shown = || feed.lock().unwrap().1.clone();
-    let mut before = 0;
+    let (mut with_earlier, mut with_sets) = (0, 0);
     while trainer.preparation().is_some() {
-        assert_eq!(shown(), earlier);
+        if shown() == earlier {
+            assert_eq!(with_sets, 0, "the earlier field does not come back");
+            with_earlier += 1;
+        } else {
+            assert!(shown().deformable().is_none(), "a set per phase");
+            with_sets += 1;
+        }
         trainer.advance(1).unwrap();
-        before += 1;
     }
-    assert!(before > 3, "sets per phase and tracking come first");
+    assert!(with_earlier > 1 && with_sets > 3, "{with_earlier} and {with_sets} advances");
     assert!(shown() != earlier && shown().deformable().is_some());
     drop(trainer);
     expect_silence(gpu);

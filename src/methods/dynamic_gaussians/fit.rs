@@ -57,11 +57,12 @@ impl GaussianFit {
         GaussianFit::new(gpu, targets, config)
     }
 
-    /// Tells whether the field of a fit of `end` iterations is worth more than one that was fitted to fewer frames.
+    /// Tells whether the field of a fit of `end` iterations is worth more than one that was fitted to fewer frames. A fit starts again
+    /// only where the earlier field does not explain a view or a phase, so that a set per phase is worth more already.
     pub(crate) fn is_presentable(&self, end: u32) -> bool {
         match self {
             GaussianFit::PerPhase(fit) => fit.step() >= end / 2,
-            GaussianFit::Start(_) => false,
+            GaussianFit::Start(start) => start.has_set_per_phase(),
             GaussianFit::Deformable(_) => true,
         }
     }

@@ -112,6 +112,15 @@ impl DeformableStart {
         }
     }
 
+    /// Tells whether a set per phase shows most of the vessels.
+    pub fn has_set_per_phase(&self) -> bool {
+        match &self.stage {
+            Stage::Warming(first) => 2 * first.step() >= self.config.deformable.warm_iterations,
+            Stage::Tracking(_) => true,
+            Stage::Over => false,
+        }
+    }
+
     /// A set per phase, as far as the field is known.
     ///
     /// # Errors

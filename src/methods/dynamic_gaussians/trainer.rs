@@ -171,7 +171,8 @@ impl Fit for GaussiansFit {
     }
 
     fn feed(&self) -> FieldFeed {
-        FieldFeed { gaussians: Some(self.feed.clone()), ..self.fields.feed() }
+        let params_fixed_until = self.fields.data().config.gaussian_iterations();
+        FieldFeed { params_fixed_until, gaussians: Some(self.feed.clone()), ..self.fields.feed() }
     }
 
     fn snapshot(&self) -> Result<Box<dyn PendingFit>> {
