@@ -24,11 +24,20 @@ pub struct SplatView {
 impl SplatView {
     /// Returns the view, at a phase, whose rays are given in world units.
     pub fn new(rays: &ViewRays, units: Units) -> SplatView {
-        let direction = rays.direction;
-        let source = rays.source() / units.pixel;
+        SplatView::of(rays.direction, rays.source() / units.pixel, 0.0)
+    }
+
+    fn of(direction: [DVec3; 3], source: DVec3, after_phase: f64) -> SplatView {
         let inverse = DMat3::from_cols(direction[0], direction[1], direction[2]).inverse();
         let rows = [0, 1, 2].map(|k| inverse.row(k));
-        SplatView { rows, offsets: rows.map(|row| -row.dot(source)), direction, source, after_phase: 0.0 }
+        SplatView { rows, offsets: rows.map(|row| -row.dot(source)), direction, source, after_phase }
+    }
+
+    /// Returns the view whose pixels, and unit of length, are `factor` times as wide.
+    pub fn coarser(&self, factor: f64) -> SplatView {
+        let [_, du, dv] = self.direction;
+        let middle = 0.5 * (factor - 1.0);
+        SplatView::of([self.ray(middle, middle), du * factor, dv * factor], self.source / factor, self.after_phase)
     }
 
     /// Returns depth, column and row of a point.
@@ -88,5 +97,8 @@ mod tests {
         let (z, u, v) = view.project(x / units.pixel);
         assert!((u - i).abs() < 1e-9 && (v - j).abs() < 1e-9);
         assert!((view.source + view.ray(u, v) * z - x / units.pixel).length() < 1e-9);
+        // The middle of the first of these wide pixels is that of the first 4 x 4 pixels.
+        let (_, wide_u, wide_v) = view.coarser(4.0).project(x / units.pixel / 4.0);
+        assert!((4.0 * wide_u + 1.5 - u).abs() < 1e-9 && (4.0 * wide_v + 1.5 - v).abs() < 1e-9);
     }
 }

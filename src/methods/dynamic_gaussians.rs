@@ -2,8 +2,10 @@
 //! to what moves in the images, then the static field to what they leave of the images.
 
 pub mod carried;
+pub mod coarse;
 pub mod data;
 pub mod deformable;
+pub(crate) mod fine;
 pub mod fit;
 pub mod lengths;
 pub mod per_phase;

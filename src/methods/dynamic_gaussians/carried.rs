@@ -44,7 +44,7 @@ impl Carried {
         if setup.n_basis != earlier.setup.n_basis {
             return Ok(Carried::anew(trainer.into_targets()));
         }
-        trainer.move_as(&earlier.on_grid(rest, setup))?;
+        trainer.move_as(&earlier.on_grid(rest, setup), setup::carried_step(&config.gaussians))?;
         let explained = min_explained(trainer.targets(), &trainer.images()?).unwrap_or(0.0);
         let percent = 100.0 * explained;
         if explained < MIN_EXPLAINED {

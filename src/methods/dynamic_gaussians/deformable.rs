@@ -155,11 +155,11 @@ impl DeformableTrainer {
     }
 
     /// Gives the Gaussians, which were fitted before, the motion of a deformable set of the same Gaussians on the same grid; iterations
-    /// go on from where the background is estimated anew.
-    pub(super) fn move_as(&mut self, deformable: &DeformableGaussians) -> Result<()> {
+    /// go on from `step`.
+    pub(super) fn move_as(&mut self, deformable: &DeformableGaussians, step: u32) -> Result<()> {
         self.gpu.upload(&self.joint.grid.motion_grid, 0, &deformable.grid)?;
         self.gpu.upload(&self.own.own_motion, 0, &deformable.own)?;
-        self.step = setup::carried_step(&self.config.gaussians);
+        self.step = step;
         Ok(self.gpu.upload(&self.joint.targets.gaussian_step, 0, &[self.step])?)
     }
 

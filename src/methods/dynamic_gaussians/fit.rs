@@ -10,6 +10,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
 use crate::methods::dynamic_gaussians::carried::Carried;
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::fine::Fine;
 use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
 use crate::methods::dynamic_gaussians::start::DeformableStart;
 use crate::methods::dynamic_gaussians::targets::Targets;
@@ -18,10 +19,10 @@ use crate::methods::dynamic_gaussians::targets::Targets;
 pub(crate) enum GaussianFit {
     /// A set per phase.
     PerPhase(Box<GaussianTrainer>),
-    /// One set for the beat, in preparation.
-    Start(Box<DeformableStart>),
-    /// One set for the beat.
-    Deformable(Box<DeformableTrainer>),
+    /// One set for the beat, in preparation; with the images that its fit ends on, where it begins on coarser ones.
+    Start(Box<DeformableStart>, Option<Box<Fine>>),
+    /// One set for the beat, likewise.
+    Deformable(Box<DeformableTrainer>, Option<Box<Fine>>),
 }
 
 impl GaussianFit {
@@ -31,7 +32,10 @@ impl GaussianFit {
     /// As [`GaussianTrainer::new`] and [`DeformableStart::new`].
     pub(crate) fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<GaussianFit> {
         Ok(match targets.form(config.gaussians.form) {
-            GaussianForm::Deformable => GaussianFit::Start(Box::new(DeformableStart::new(gpu, targets, config)?)),
+            GaussianForm::Deformable => {
+                let (targets, fine) = Fine::split(gpu, targets, config);
+                GaussianFit::Start(Box::new(DeformableStart::new(gpu, targets, config)?), fine)
+            }
             _ => GaussianFit::PerPhase(Box::new(GaussianTrainer::new(gpu, targets, config)?)),
         })
     }
@@ -50,7 +54,7 @@ impl GaussianFit {
             (targets.form(config.gaussians.form), earlier.deformable())
         {
             match Carried::new(gpu, targets, config, deformable)? {
-                Carried::On(fit) => return Ok(GaussianFit::Deformable(fit)),
+                Carried::On(fit) => return Ok(GaussianFit::Deformable(fit, None)),
                 Carried::Anew(same) => targets = *same,
             }
         }
@@ -62,8 +66,8 @@ impl GaussianFit {
     pub(crate) fn is_presentable(&self, end: u32) -> bool {
         match self {
             GaussianFit::PerPhase(fit) => fit.step() >= end / 2,
-            GaussianFit::Start(start) => start.has_set_per_phase(),
-            GaussianFit::Deformable(_) => true,
+            GaussianFit::Start(start, _) => start.has_set_per_phase(),
+            GaussianFit::Deformable(..) => true,
         }
     }
 
@@ -71,16 +75,16 @@ impl GaussianFit {
     pub(crate) fn step(&self) -> u32 {
         match self {
             GaussianFit::PerPhase(fit) => fit.step(),
-            GaussianFit::Start(_) => 0,
-            GaussianFit::Deformable(fit) => fit.step(),
+            GaussianFit::Start(..) => 0,
+            GaussianFit::Deformable(fit, _) => fit.step(),
         }
     }
 
     /// Share done of the preparation before the first iteration; none when that has begun.
     pub(crate) fn preparation(&self) -> Option<f64> {
         match self {
-            GaussianFit::Start(start) => Some(start.share()),
-            GaussianFit::PerPhase(_) | GaussianFit::Deformable(_) => None,
+            GaussianFit::Start(start, _) => Some(start.share()),
+            GaussianFit::PerPhase(_) | GaussianFit::Deformable(..) => None,
         }
     }
 
@@ -91,13 +95,22 @@ impl GaussianFit {
     pub(crate) fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
         match self {
             GaussianFit::PerPhase(fit) => fit.advance(until),
-            GaussianFit::Start(start) => {
+            GaussianFit::Start(start, fine) => {
                 if let Some(deformable) = start.advance()? {
-                    *self = GaussianFit::Deformable(Box::new(deformable));
+                    *self = GaussianFit::Deformable(Box::new(deformable), fine.take());
                 }
                 Ok(Vec::new())
             }
-            GaussianFit::Deformable(fit) => fit.advance(until),
+            GaussianFit::Deformable(fit, fine) => {
+                let from = fine.as_ref().map_or(u32::MAX, |fine| fine.from());
+                if fit.step() >= from
+                    && let Some(fine) = fine.take()
+                {
+                    **fit = fine.go_on(fit)?;
+                    return fit.advance(until);
+                }
+                fit.advance(until.min(from))
+            }
         }
     }
 
@@ -108,8 +121,8 @@ impl GaussianFit {
     pub(crate) fn field(&self) -> Result<DynamicGaussians> {
         Ok(match self {
             GaussianFit::PerPhase(fit) => DynamicGaussians::PerPhase(fit.model()?),
-            GaussianFit::Start(start) => DynamicGaussians::PerPhase(start.field()?),
-            GaussianFit::Deformable(fit) => DynamicGaussians::Deformable(fit.deformable()?),
+            GaussianFit::Start(start, _) => DynamicGaussians::PerPhase(start.field()?),
+            GaussianFit::Deformable(fit, _) => DynamicGaussians::Deformable(fit.deformable()?),
         })
     }
 
@@ -117,8 +130,8 @@ impl GaussianFit {
     pub(crate) fn count(&self) -> u32 {
         match self {
             GaussianFit::PerPhase(fit) => fit.count(),
-            GaussianFit::Start(start) => start.count(),
-            GaussianFit::Deformable(fit) => fit.count(),
+            GaussianFit::Start(start, _) => start.count(),
+            GaussianFit::Deformable(fit, _) => fit.count(),
         }
     }
 
@@ -126,7 +139,7 @@ impl GaussianFit {
     pub(crate) fn form(&self) -> GaussianForm {
         match self {
             GaussianFit::PerPhase(_) => GaussianForm::Phase,
-            GaussianFit::Start(_) | GaussianFit::Deformable(_) => GaussianForm::Deformable,
+            GaussianFit::Start(..) | GaussianFit::Deformable(..) => GaussianForm::Deformable,
         }
     }
 
@@ -137,8 +150,8 @@ impl GaussianFit {
     pub(crate) fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         match self {
             GaussianFit::PerPhase(fit) => fit.profile_step(),
-            GaussianFit::Start(_) => Err(not_begun()),
-            GaussianFit::Deformable(fit) => fit.profile_step(),
+            GaussianFit::Start(..) => Err(not_begun()),
+            GaussianFit::Deformable(fit, _) => fit.profile_step(),
         }
     }
 
@@ -149,8 +162,8 @@ impl GaussianFit {
     pub(crate) fn work(&self) -> Result<GaussianWork> {
         match self {
             GaussianFit::PerPhase(fit) => fit.work(),
-            GaussianFit::Start(_) => Err(not_begun()),
-            GaussianFit::Deformable(fit) => fit.work(),
+            GaussianFit::Start(..) => Err(not_begun()),
+            GaussianFit::Deformable(fit, _) => fit.work(),
         }
     }
 }

@@ -123,6 +123,12 @@ pub fn carried_step(settings: &sections::Gaussians) -> u32 {
     (1..settings.iterations).find(|step| renews_background(settings, *step)).unwrap_or(0)
 }
 
+/// Returns the iteration from which a fit that began on coarser images goes on with all pixels: the last one before which the background
+/// is estimated anew; none without any.
+pub fn fine_step(settings: &sections::Gaussians) -> Option<u32> {
+    (1..settings.iterations).rev().find(|step| renews_background(settings, *step))
+}
+
 /// Returns where iterations from `step` on towards `until` must stop, because something must be done before the next one.
 pub fn next_stop(settings: &sections::Gaussians, step: u32, until: u32) -> u32 {
     (step + 1..until)
@@ -152,9 +158,10 @@ mod tests {
         let settings = Config::preset(Preset::Fast).gaussians;
         let stops = std::iter::successors(Some(0), |s| (*s < 120).then(|| next_stop(&settings, *s, 120)));
         assert_eq!(stops.collect::<Vec<_>>(), [0, 40, 50, 65, 80, 120]);
-        assert_eq!(carried_step(&settings), 40);
+        assert_eq!((carried_step(&settings), fine_step(&settings)), (40, Some(80)));
         assert!(renews_background(&settings, 40) && !renews_background(&settings, 0) && grows(&settings, 50));
         let never = sections::Gaussians { background_every: 0, grow_at: 0, clear_at: 0, ..settings };
         assert_eq!((next_stop(&never, 3, 70), renews_background(&never, 40), carried_step(&never)), (70, false, 0));
+        assert_eq!(fine_step(&never), None);
     }
 }

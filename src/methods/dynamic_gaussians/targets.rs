@@ -274,10 +274,15 @@ fn no_common_motion(motion: &SoftMotion) -> String {
 
 /// Weights of residuals: lower where pixels are noisy, so that the loss bends later there, and 0 where pixels are hidden.
 fn weights(dataset: &Dataset, view: &ViewEvidence, strongest: f64, scale: f64) -> Vec<f32> {
-    let weight = |(pixel, noise): (usize, &f32)| match f64::from(*noise) / strongest {
-        _ if !dataset.shows(view.view, pixel) => 0.0,
-        noise if scale > 0.0 => (1.0 / (1.0 + (noise / scale).powi(2)).sqrt()) as f32,
-        _ => 1.0,
+    let weight = |(pixel, noise): (usize, &f32)| match dataset.shows(view.view, pixel) {
+        true => weight_of_noise(f64::from(*noise) / strongest, scale),
+        false => 0.0,
     };
     view.background.noise.values.iter().enumerate().map(weight).collect()
+}
+
+/// Weight of a pixel with a standard deviation of noise, a share of the strongest change; `scale` is that at which weights fall, 0 for
+/// equal weights.
+pub(super) fn weight_of_noise(noise: f64, scale: f64) -> f32 {
+    if scale > 0.0 { (1.0 / (1.0 + (noise / scale).powi(2)).sqrt()) as f32 } else { 1.0 }
 }

@@ -1,0 +1,51 @@
+//! Last part of a fit that began on coarser images, with all pixels.
+
+use crate::config::Config;
+use crate::error::Result;
+use crate::gaussians::particles::Particles;
+use crate::gpu::device::Gpu;
+use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::setup;
+use crate::methods::dynamic_gaussians::targets::Targets;
+
+/// Images with all pixels, for a fit that begins on coarser ones.
+pub(crate) struct Fine {
+    gpu: Gpu,
+    targets: Targets,
+    config: Config,
+    /// Iteration from which on all pixels are used.
+    from: u32,
+}
+
+impl Fine {
+    /// Returns the targets that a fit begins on, and those that it ends on where they are finer.
+    pub(crate) fn split(gpu: &Gpu, targets: Targets, config: &Config) -> (Targets, Option<Box<Fine>>) {
+        let factor = targets.coarse_factor();
+        match setup::fine_step(&config.gaussians).filter(|_| factor > 1) {
+            Some(from) => {
+                let coarse = targets.coarser(factor, config.gaussians.noise_scale);
+                (coarse, Some(Box::new(Fine { gpu: gpu.clone(), targets, config: config.clone(), from })))
+            }
+            None => (targets, None),
+        }
+    }
+
+    /// Returns the iteration from which on all pixels are used.
+    pub(crate) fn from(&self) -> u32 {
+        self.from
+    }
+
+    /// Goes on from the deformable set that was fitted to the coarser images.
+    ///
+    /// # Errors
+    /// As [`DeformableTrainer::with`] and [`DeformableTrainer::deformable`].
+    pub(crate) fn go_on(self, coarse: &DeformableTrainer) -> Result<DeformableTrainer> {
+        let earlier = coarse.deformable()?;
+        let rest = earlier.rest.in_units(self.targets.units);
+        let particles = Particles::fresh(rest.rows.clone());
+        let mut trainer = DeformableTrainer::with(&self.gpu, self.targets, &self.config, &particles)?;
+        let setup = *trainer.deformable_setup();
+        trainer.move_as(&earlier.on_grid(rest, setup), self.from)?;
+        Ok(trainer)
+    }
+}
