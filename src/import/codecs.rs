@@ -1,5 +1,6 @@
 //! Transfer syntaxes, and images as they compress them: one frame of grey values at a time.
 
+use crate::formats::decoders::caught;
 use crate::import::elements::syntax;
 use hayro_jpeg2000::{DecodeSettings, DecoderContext, Image};
 use jpeg_decoder::{Decoder, PixelFormat, UnsupportedFeature};
@@ -64,16 +65,10 @@ impl Codec {
         match self {
             Codec::Native => native(bytes, size[0] * size[1], bytes_per_value, false),
             Codec::Rle => rle(bytes, size[0] * size[1], bytes_per_value),
-            Codec::Jpeg => caught(|| jpeg(bytes, size)),
-            Codec::Jpeg2000 => caught(|| jpeg2000(bytes, size)),
+            Codec::Jpeg => caught(|| jpeg(bytes, size))?,
+            Codec::Jpeg2000 => caught(|| jpeg2000(bytes, size))?,
         }
     }
-}
-
-/// Runs a decoder of others, which may panic on a damaged image; that becomes an error of the file.
-fn caught(decode: impl FnOnce() -> Result<Vec<u32>, String>) -> Result<Vec<u32>, String> {
-    let decoded = std::panic::catch_unwind(std::panic::AssertUnwindSafe(decode));
-    decoded.unwrap_or_else(|_| Err("its image is damaged, and the decoder failed on it".into()))
 }
 
 /// Sentence about a codec that is not read.

@@ -1,5 +1,6 @@
 //! Reads grey frames from pictures: PNG, JPEG and TIFF, also of several pages.
 
+use crate::decoders;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::image_limits::{MAX_FILE_BYTES, MAX_SIDE};
@@ -47,15 +48,19 @@ pub fn read(path: &Path) -> Result<Vec<GreyFrame>> {
     let bad = |problem: String| Error::data(path, "picture", problem);
     let format = format_of(path).ok_or_else(|| bad("is none of .png .jpg .jpeg .tif .tiff".into()))?;
     let bytes = files::read_limited(path, MAX_FILE_BYTES)?;
-    if format == ImageFormat::Tiff {
-        return pages(&bytes).map_err(bad);
-    }
+    decoders::caught(|| if format == ImageFormat::Tiff { pages(&bytes) } else { picture(&bytes, format) })
+        .and_then(|frames| frames)
+        .map_err(bad)
+}
+
+/// Reads the only frame of a PNG or JPEG file.
+fn picture(bytes: &[u8], format: ImageFormat) -> std::result::Result<Vec<GreyFrame>, String> {
     let mut reader = image::ImageReader::with_format(Cursor::new(bytes), format);
     let mut limits = image::Limits::default();
     (limits.max_image_width, limits.max_image_height) = (Some(MAX_SIDE as u32), Some(MAX_SIDE as u32));
     reader.limits(limits);
-    let decoded = reader.decode().map_err(|e| bad(e.to_string()))?;
-    Ok(vec![grey(decoded).map_err(bad)?])
+    let decoded = reader.decode().map_err(|e| e.to_string())?;
+    Ok(vec![grey(decoded)?])
 }
 
 fn grey(decoded: DynamicImage) -> std::result::Result<GreyFrame, String> {
