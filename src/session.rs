@@ -91,7 +91,7 @@ impl Session {
                 taken: Mutex::default(),
                 control: Mutex::new(Control {
                     state: State::Idle,
-                    failure: None,
+                    reason: None,
                     worker: None,
                     news: Instant::now(),
                     news_apart: Duration::MAX,
@@ -242,13 +242,23 @@ impl Session {
         self.shared.is_busy()
     }
 
-    /// Error that ended training in the background, if one did.
+    /// Returns the error that ended training in the background, if one did.
     pub fn failure(&self) -> Option<String> {
-        lock(&self.shared.control).failure.clone()
+        self.reason(State::Failed)
+    }
+
+    /// Returns the reason why training in the background waits for other frames, while it does.
+    pub fn waits_for(&self) -> Option<String> {
+        self.reason(State::Waiting)
+    }
+
+    fn reason(&self, of: State) -> Option<String> {
+        let control = lock(&self.shared.control);
+        control.reason.clone().filter(|_| control.state == of)
     }
 
     /// Trains up to `iterations` more, with the frames there are, and returns how many were done: fewer at the end of
-    /// the run, or when the observer ends it.
+    /// the run, or when the observer ends it, or [`Session::close`].
     ///
     /// # Errors
     /// [`Error::Busy`] while it trains already, [`Error::NotReady`] without frames enough, [`Error::NoDevice`];
@@ -280,7 +290,7 @@ impl Session {
                 (progress, engine.step() >= end)
             };
             let go_on = progress.is_none_or(|p| observe(&p));
-            if done || !go_on {
+            if done || !go_on || shared.long_work.is_closed() {
                 let mut engine = shared.visit();
                 shared.drain(&mut engine)?;
                 return Ok(engine.step() - first);
@@ -303,7 +313,7 @@ impl Session {
         shared.pause.store(false, Ordering::Release);
         {
             let mut control = lock(&shared.control);
-            (control.state, control.failure) = (State::Running, None);
+            (control.state, control.reason) = (State::Running, None);
         }
         let dispatch = tracing::dispatcher::get_default(Clone::clone);
         let spawned = std::thread::Builder::new().name(TRAINING_THREAD.into()).spawn(move || {
@@ -319,10 +329,10 @@ impl Session {
                 let mut control = lock(&shared.control);
                 control.worker = None;
                 match outcome {
-                    Ok(state) => control.state = state,
+                    Ok(state) => (control.state, control.reason) = (state, None),
                     Err(error) => {
                         tracing::error!("training in the background failed: {error}");
-                        (control.state, control.failure) = (State::Failed, Some(error.to_string()));
+                        (control.state, control.reason) = (State::Failed, Some(error.to_string()));
                     }
                 }
                 drop(control);
@@ -492,6 +502,22 @@ impl Session {
     /// [`Error::Interrupted`] before its next slice; work that begins later is not affected.
     pub fn cancel(&self) {
         self.shared.long_work.cancel();
+    }
+
+    /// Ends training, in the background and in other threads, after the iterations under way, and long work in other threads as
+    /// [`Session::cancel`] does, also long work that begins later.
+    ///
+    /// # Errors
+    /// As [`Session::stop`].
+    pub fn close(&self) -> Result<()> {
+        self.stop()?;
+        self.shared.long_work.close();
+        Ok(())
+    }
+
+    /// Tells whether [`Session::close`] was called.
+    pub fn is_closed(&self) -> bool {
+        self.shared.long_work.is_closed()
     }
 
     /// Calls a function before each slice of long work, in the thread that does the work, from the next call on: a place for work

@@ -121,8 +121,9 @@ pub unsafe extern "C" fn nertca_reconstruction_create(
     })
 }
 
-/// Destroys a reconstruction: stops its training, waits for calls on it in other threads, and frees its memory. Null is
-/// allowed, and does nothing. Callable from any thread except inside its own callbacks.
+/// Destroys a reconstruction: stops its training, ends long calls on it in other threads, waits for all calls there, and frees its
+/// memory. `_train`, `_evaluate`, `_tree`, `_sample` and exact pictures under way return NERTCA_ERROR_CANCELLED, after the iterations
+/// or before the slice that they are at. Null is allowed, and does nothing. Callable from any thread except inside its own callbacks.
 ///
 /// @return NERTCA_ERROR_BUSY, with nothing done, from inside a callback of a call on it.
 ///
@@ -139,7 +140,7 @@ pub unsafe extern "C" fn nertca_reconstruction_destroy(reconstruction: *mut nert
         }
         let log = {
             let found = handles::get::<Reconstruction, _>(reconstruction)?;
-            found.session.stop()?;
+            found.session.close()?;
             found.claim.context.log.clone()
         };
         tracing::dispatcher::with_default(&log, || handles::remove::<Reconstruction, _>(reconstruction).map(drop))
@@ -312,8 +313,8 @@ pub unsafe extern "C" fn nertca_reconstruction_progress(
     })
 }
 
-/// Returns the reason why training in the background failed; empty when it did not. `text`, `size` and `length` work as in
-/// `nertca_last_error`. Callable from any thread.
+/// Returns the reason why training in the background failed, or, in the state NERTCA_STATE_WAITING, why it cannot go on with the frames
+/// there are; empty otherwise. `text`, `size` and `length` work as in `nertca_last_error`. Callable from any thread.
 ///
 /// # Safety
 /// `text` must hold `size` bytes; `length` must be writable or null.
@@ -325,7 +326,8 @@ pub unsafe extern "C" fn nertca_reconstruction_failure(
     length: *mut usize,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        let failure = reconstruction.session.failure().unwrap_or_default();
+        let session = &reconstruction.session;
+        let failure = session.failure().or_else(|| session.waits_for()).unwrap_or_default();
         // SAFETY: the header requires that `text` holds `size` bytes and that `length` is null or can be written.
         unsafe { copy_text(&failure, text, size, length) }
     })

@@ -8,6 +8,7 @@ use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::*;
 use nertca_vk::capi::training::*;
 use nertca_vk::capi::types::*;
+use std::ffi::CStr;
 use std::ptr::{null, null_mut};
 use std::time::Duration;
 
@@ -183,6 +184,76 @@ fn training_waits_when_frames_become_too_few_and_goes_on_when_they_come() {
     ok(nertca_reconstruction_stop(made), made);
     assert_eq!(progress(made).state, NERTCA_STATE_IDLE);
     close(context, &[made]);
+}
+
+fn failure_of(reconstruction: *mut nertca_reconstruction) -> String {
+    let mut text = [0; 1024];
+    let written = unsafe { nertca_reconstruction_failure(reconstruction, text.as_mut_ptr(), text.len(), &mut 0) };
+    ok(written, reconstruction);
+    unsafe { CStr::from_ptr(text.as_ptr()) }.to_str().unwrap().to_owned()
+}
+
+#[test]
+fn training_waits_for_frames_that_the_settings_can_be_met_with() {
+    let context = context("validation = true");
+    let made = reconstruction(context, SMALL);
+    // Contrast has not come yet: the frames of a view are alike.
+    for view in 0..2 {
+        for phase in 0..PHASES {
+            let blank = vec![0.8; (SIZE * SIZE) as usize];
+            ok(unsafe { nertca_reconstruction_add_frame(made, &frame(view, phase, &blank)) }, made);
+        }
+    }
+    let status = unsafe { nertca_reconstruction_train(made, 1, None, null_mut(), null_mut()) };
+    assert_eq!(status, NERTCA_ERROR_NOT_READY, "{}", last_error(made));
+    ok(unsafe { nertca_reconstruction_start(made, None, null_mut()) }, made);
+    wait_until("waiting for frames", || progress(made).state == NERTCA_STATE_WAITING);
+    assert!(failure_of(made).contains("nothing changes over the beat"), "{}", failure_of(made));
+    add_frames(made, 0..3);
+    wait_until("training with all frames", || progress(made).step > 0);
+    assert_eq!(failure_of(made), "");
+    ok(nertca_reconstruction_stop(made), made);
+    assert_eq!((progress(made).state, failure_of(made)), (NERTCA_STATE_IDLE, String::new()));
+    close(context, &[made]);
+}
+
+#[test]
+fn a_method_that_needs_all_phases_waits_for_the_last() {
+    let context = context("validation = true");
+    let made = reconstruction(context, "phases = 3\npreset = r2-gaussian\ntrain.iterations = 20");
+    let add = |phases: std::ops::Range<u32>| {
+        for (view, phase) in phases.flat_map(|phase| (0..3).map(move |view| (view, phase))) {
+            let pixels = pixels(view, phase);
+            ok(unsafe { nertca_reconstruction_add_frame(made, &frame(view, phase, &pixels)) }, made);
+        }
+    };
+    add(0..2);
+    ok(unsafe { nertca_reconstruction_start(made, None, null_mut()) }, made);
+    wait_until("waiting for frames", || progress(made).state == NERTCA_STATE_WAITING);
+    assert!(failure_of(made).contains("no image shows the phases [2]"), "{}", failure_of(made));
+    add(2..3);
+    wait_until("training with all phases", || progress(made).step > 0);
+    ok(nertca_reconstruction_stop(made), made);
+    close(context, &[made]);
+}
+
+#[test]
+fn training_in_another_thread_ends_when_its_reconstruction_is_destroyed() {
+    let context = context("validation = true");
+    let made = reconstruction(context, &SMALL.replace("train.iterations = 60", "train.iterations = 1000000"));
+    add_frames(made, 0..3);
+    let handle = made.addr();
+    let training = std::thread::spawn(move || {
+        let made = std::ptr::with_exposed_provenance_mut(handle);
+        let mut done = 0;
+        (unsafe { nertca_reconstruction_train(made, 1_000_000, None, null_mut(), &mut done) }, done)
+    });
+    wait_until("training", || progress(made).step > 0);
+    ok(unsafe { nertca_reconstruction_destroy(made) }, made);
+    let (status, done) = training.join().unwrap();
+    assert_eq!(status, NERTCA_ERROR_CANCELLED);
+    assert!((1..1_000_000).contains(&done), "{done}");
+    close(context, &[]);
 }
 
 #[test]
