@@ -24,6 +24,7 @@ use crate::render::grid::PatientGrid;
 use crate::render::live::Source;
 use crate::render::quantity::Quantity;
 use crate::render::renderer::{Renderer, Rendering};
+use crate::scan::at_rest;
 use crate::scan::gating::{BeatTime, RPeaks};
 use crate::trees::extract::{TreeOptions, vessel_trees};
 use crate::trees::tree::BeatTree;
@@ -57,8 +58,11 @@ impl Session {
     ///
     /// # Errors
     /// [`Error::Config`] naming the option that no session could use.
-    pub fn new(gpu: Option<Gpu>, tuning: Option<Tuning>, options: SessionOptions) -> Result<Session> {
+    pub fn new(gpu: Option<Gpu>, tuning: Option<Tuning>, mut options: SessionOptions) -> Result<Session> {
         options.config.check()?;
+        if options.still {
+            options.phases = phases_at_rest(options.phases)?;
+        }
         if options.phases == 0 || options.phases > 4096 {
             return Err(Error::config("phases", options.phases, "is out of range: 1 to 4096 phases are accepted"));
         }
@@ -549,12 +553,16 @@ impl Session {
         let model = &checkpoint.model;
         let mut engine = self.shared.visit();
         let mut inbox = lock(&self.shared.inbox);
-        let phases = model.param_map.phases as u32;
+        let (phases, still) = (model.param_map.phases as u32, model.scene.still);
         if inbox.options.phases != phases && !inbox.frames.is_empty() {
             let problem = format!("the session has frames of a beat of {} phases", inbox.options.phases);
             return Err(Error::config("checkpoint: phases", phases, problem));
         }
-        inbox.options.phases = phases;
+        if inbox.options.still != still && !inbox.frames.is_empty() {
+            let problem = format!("the session has frames of an object for which it is {}", inbox.options.still);
+            return Err(Error::config("checkpoint: still", still, problem));
+        }
+        (inbox.options.phases, inbox.options.still) = (phases, still);
         inbox.options.config = model.config.clone();
         engine.training = None;
         engine.version = 0;
@@ -565,6 +573,18 @@ impl Session {
         engine.saved = Some(checkpoint);
         Ok(())
     }
+}
+
+/// Returns the number of phases of an object at rest.
+///
+/// # Errors
+/// [`Error::Config`] where more are given.
+fn phases_at_rest(given: u32) -> Result<u32> {
+    if given > at_rest::PHASES {
+        let problem = "an object at rest has phase 0 and, where they are known, images without vessels as phase 1";
+        return Err(Error::config("phases", given, problem));
+    }
+    Ok(at_rest::PHASES)
 }
 
 /// Waits for the thread that trains; other callers that wait for it get the lock after that.

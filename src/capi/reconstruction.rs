@@ -15,6 +15,7 @@ use crate::capi::types::{
 use crate::checkpoint::Checkpoint;
 use crate::choice::Choice;
 use crate::config::{Config, Preset};
+use crate::scan::at_rest;
 use crate::scan::gating::RPeaks;
 use crate::session::{FrameUse, Progress, Session, SessionOptions};
 use crate::trees::tree::BeatTree;
@@ -63,6 +64,7 @@ fn session(context: &Context, mut options: Options) -> Outcome<Session> {
     let phases = options.take_as("phases", number)?;
     let depth = options.take_as("depth_half_extent_mm", number)?;
     let vessel = options.take_as("vessel_attenuation_per_mm", number)?;
+    let still = options.take_as("still", "true or false")?.unwrap_or(false);
     let preset = match options.take("preset") {
         None => None,
         Some(name) => Some(
@@ -73,10 +75,12 @@ fn session(context: &Context, mut options: Options) -> Outcome<Session> {
     let config = Config::load(preset, None, &options.settings())?;
     let options = SessionOptions {
         config,
-        phases: phases.ok_or_else(|| Failure::argument("phases", "is missing: give the number of cardiac phases"))?,
+        phases: phases
+            .or(still.then_some(at_rest::PHASES))
+            .ok_or_else(|| Failure::argument("phases", "is missing: give the number of cardiac phases"))?,
         depth_half_extent_mm: depth.unwrap_or(100.0),
         vessel_attenuation_per_mm: vessel,
-        still: false,
+        still,
         deterministic: context.deterministic,
     };
     Ok(Session::new(context.gpu.clone(), context.tuning.clone(), options)?)
@@ -84,7 +88,9 @@ fn session(context: &Context, mut options: Options) -> Outcome<Session> {
 
 /// Creates a reconstruction without frames.
 ///
-/// `options` are lines of `key = value` or a JSON object: `phases` (number of cardiac phases; required), `depth_half_extent_mm`
+/// `options` are lines of `key = value` or a JSON object: `phases` (number of cardiac phases; required, unless `still` is true), `still`
+/// (`true` for an object at rest, as in `dataset.json`: frames of phase 0 show it, and frames of phase 1 the same without vessels, which
+/// are estimated for views that have none; frames with a time need no R-peaks; the result has one phase, 0), `depth_half_extent_mm`
 /// (attenuation is searched within this distance of the isocentre plane; 100), `vessel_attenuation_per_mm` (attenuation of
 /// filled vessels, where known: sets the Dice threshold), `preset` (fast, fast-mlp, paper, public-code, nerf-ca, r2-gaussian,
 /// x-gaussian or sax-nerf) and every key that `nertca-vk train --print-config` shows, as in `train.iterations = 800`.

@@ -8,6 +8,9 @@ use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::*;
 use nertca_vk::capi::training::*;
 use nertca_vk::capi::types::*;
+use nertca_vk::formats::npy;
+use nertca_vk::geometry::{CArm, Geometry};
+use nertca_vk::scan::dataset::Dataset;
 use std::ffi::CStr;
 use std::ptr::{null, null_mut};
 use std::time::Duration;
@@ -254,6 +257,61 @@ fn training_in_another_thread_ends_when_its_reconstruction_is_destroyed() {
     assert_eq!(status, NERTCA_ERROR_CANCELLED);
     assert!((1..1_000_000).contains(&done), "{done}");
     close(context, &[]);
+}
+
+/// Line integrals of a thin vessel along the axis of the patient, which all views show in their middle, on a gradient.
+fn vessel_at_rest() -> Vec<f32> {
+    let at = |p: u32| (p % SIZE, p / SIZE);
+    let is_vessel = |x: u32, y: u32| (9..11).contains(&x) && (5..15).contains(&y);
+    let value = |(x, y): (u32, u32)| 0.8 + 0.01 * x as f32 + if is_vessel(x, y) { 0.5 } else { 0.0 };
+    (0..SIZE * SIZE).map(at).map(value).collect()
+}
+
+/// Images without vessels that a dataset of the same views has, whose manifest says that the object is at rest.
+fn appearance_without_vessels() -> Vec<Vec<f32>> {
+    let directory = tempfile::tempdir().unwrap();
+    let image = vessel_at_rest();
+    npy::write(&directory.path().join("i.npy"), &[SIZE as usize, SIZE as usize], &image).unwrap();
+    let frame = |view: usize| {
+        let nertca_geometry { primary_deg, secondary_deg, sid_mm, sod_mm, pixel_mm, .. } = geometry(view);
+        let (offset_mm, table_mm) = ([0.0; 2], [0.0; 3]);
+        let c_arm = CArm { primary_deg, secondary_deg, sid_mm, sod_mm, pixel_mm, offset_mm, table_mm };
+        serde_json::json!({"image": "i.npy", "phase": 0, "split": "train", "intensity": {"kind": "integral"}, "geometry": Geometry::CArm(c_arm)})
+    };
+    let manifest = serde_json::json!({"format": "nertca-dataset", "version": 1, "phases": 1, "still": true, "depth_half_extent_mm": 90,
+        "vessel_attenuation_per_mm": 0.01, "frames": [frame(0), frame(1), frame(2)]});
+    std::fs::write(directory.path().join("dataset.json"), manifest.to_string()).unwrap();
+    let dataset = Dataset::open(directory.path()).unwrap();
+    let estimated: Vec<_> = dataset.frames.iter().filter(|f| f.phase == 1).map(|f| f.integrals.clone()).collect();
+    assert!(estimated.len() == 3 && estimated.iter().all(|f| *f != image));
+    estimated
+}
+
+#[test]
+fn an_object_at_rest_is_reconstructed_as_the_same_dataset_is() {
+    let context = context("validation = true\ndeterministic = true");
+    let options = SMALL.replace("phases = 3", "still = true");
+    let (estimating, given) = (reconstruction(context, &options), reconstruction(context, &options));
+    let image = vessel_at_rest();
+    for view in 0..3 {
+        // A frame needs no phase.
+        let timed = nertca_frame { phase: -1, time_s: 0.3 * view as f64, ..frame(view, 0, &image) };
+        ok(unsafe { nertca_reconstruction_add_frame(estimating, &timed) }, estimating);
+        ok(unsafe { nertca_reconstruction_add_frame(given, &frame(view, 0, &image)) }, given);
+    }
+    assert_eq!(uses(estimating, 0..3), [0, 1, 2].map(|view| (view, NERTCA_USE_TRAINING, 0)));
+    for (view, background) in appearance_without_vessels().iter().enumerate() {
+        ok(unsafe { nertca_reconstruction_add_frame(given, &frame(view, 1, background)) }, given);
+    }
+    train(estimating, 5);
+    train(given, 5);
+    assert!(bytes_of(estimating) == bytes_of(given), "the estimated images are those of the dataset");
+    let middle = |picture: Vec<f32>| picture[(SIZE * SIZE / 2 + SIZE / 2) as usize];
+    let moving = |phase| nertca_view { component: NERTCA_COMPONENT_DYNAMIC, ..view(phase) };
+    assert!(middle(drawn(estimating, &moving(0))) > 0.0, "the vessel is seen");
+    let third = frame(0, 2, &image);
+    assert_eq!(unsafe { nertca_reconstruction_add_frame(given, &third) }, NERTCA_ERROR_ARGUMENT, "no third phase");
+    close(context, &[estimating, given]);
 }
 
 #[test]
