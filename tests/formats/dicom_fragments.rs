@@ -262,7 +262,8 @@ fn jpeg_ls_frames_are_read() {
     let eight_bits = include_bytes!("../common/frames/lossless.jls").as_slice();
     let twelve_bits = include_bytes!("../common/frames/lossless12.jls").as_slice();
     let rounded = include_bytes!("../common/frames/near.jls").as_slice();
-    let kinds: [(&str, &[u8], u16, &dyn Fn(usize, usize) -> usize, f32); 3] = [
+    type Pixel<'a> = &'a dyn Fn(usize, usize) -> usize;
+    let kinds: [(&str, &[u8], u16, Pixel<'_>, f32); 3] = [
         (lossless, eight_bits, 8, &eight, 0.0),
         (lossless, twelve_bits, 12, &twelve, 0.0),
         (near, rounded, 12, &twelve, 2.0),
