@@ -107,7 +107,7 @@
 #define NERTCA_STATE_PAUSED 2
 
 /**
- * Waiting: training in the background starts as soon as there are enough frames.
+ * Waiting: training in the background goes on as soon as there are enough frames that the settings can be met with.
  */
 #define NERTCA_STATE_WAITING 3
 
@@ -1026,7 +1026,9 @@ nertca_status nertca_context_destroy(nertca_context *context);
 /**
  * Creates a reconstruction without frames.
  *
- * `options` are lines of `key = value` or a JSON object: `phases` (number of cardiac phases; required), `depth_half_extent_mm`
+ * `options` are lines of `key = value` or a JSON object: `phases` (number of cardiac phases; required, unless `still` is true), `still`
+ * (`true` for an object at rest, as in `dataset.json`: frames of phase 0 show it, and frames of phase 1 the same without vessels, which
+ * are estimated for views that have none; frames with a time need no R-peaks; the result has one phase, 0), `depth_half_extent_mm`
  * (attenuation is searched within this distance of the isocentre plane; 100), `vessel_attenuation_per_mm` (attenuation of
  * filled vessels, where known: sets the Dice threshold), `preset` (fast, fast-mlp, paper, public-code, nerf-ca, r2-gaussian,
  * x-gaussian or sax-nerf) and every key that `nertca-vk train --print-config` shows, as in `train.iterations = 800`.
@@ -1041,8 +1043,9 @@ nertca_status nertca_reconstruction_create(nertca_context *context,
                                            nertca_reconstruction **reconstruction);
 
 /**
- * Destroys a reconstruction: stops its training, waits for calls on it in other threads, and frees its memory. Null is
- * allowed, and does nothing. Callable from any thread except inside its own callbacks.
+ * Destroys a reconstruction: stops its training, ends long calls on it in other threads, waits for all calls there, and frees its
+ * memory. `_train`, `_evaluate`, `_tree`, `_sample` and exact pictures under way return NERTCA_ERROR_CANCELLED, after the iterations
+ * or before the slice that they are at. Null is allowed, and does nothing. Callable from any thread except inside its own callbacks.
  *
  * @return NERTCA_ERROR_BUSY, with nothing done, from inside a callback of a call on it.
  *
@@ -1131,8 +1134,8 @@ nertca_status nertca_reconstruction_progress(nertca_reconstruction *reconstructi
                                              nertca_progress *progress);
 
 /**
- * Returns the reason why training in the background failed; empty when it did not. `text`, `size` and `length` work as in
- * `nertca_last_error`. Callable from any thread.
+ * Returns the reason why training in the background failed, or, in the state NERTCA_STATE_WAITING, why it cannot go on with the frames
+ * there are; empty otherwise. `text`, `size` and `length` work as in `nertca_last_error`. Callable from any thread.
  *
  * # Safety
  * `text` must hold `size` bytes; `length` must be writable or null.
@@ -1246,8 +1249,9 @@ nertca_status nertca_reconstruction_set_view_geometry(nertca_reconstruction *rec
  *
  * Only one such call at a time is allowed on a reconstruction; other threads may make all other calls meanwhile.
  *
- * @return NERTCA_ERROR_CANCELLED when the callback ended the call; NERTCA_ERROR_NOT_READY without enough frames;
- * NERTCA_ERROR_BUSY while training in the background; NERTCA_ERROR_DIVERGED, with the last good state kept.
+ * @return NERTCA_ERROR_CANCELLED when the callback ended the call, or `nertca_reconstruction_destroy`; NERTCA_ERROR_NOT_READY without
+ * enough frames, or where the settings cannot be met with them; NERTCA_ERROR_BUSY while training in the background;
+ * NERTCA_ERROR_DIVERGED, with the last good state kept.
  *
  * # Safety
  * `done` must be writable or null; `progress` must be callable with `user`.
@@ -1259,8 +1263,10 @@ nertca_status nertca_reconstruction_train(nertca_reconstruction *reconstruction,
                                           uint32_t *done);
 
 /**
- * Trains in the background until the run is complete, and waits for frames while there are too few. `progress` may be
- * null; it is called on the training thread, and a non-zero result of it ends training. Callable from any thread.
+ * Trains in the background until the run is complete. While there are too few frames, or the settings cannot be met with those there
+ * are (nothing moves in them, for example), it waits for more or other ones in the state NERTCA_STATE_WAITING;
+ * `nertca_reconstruction_failure` tells why. `progress` may be null; it is called on the training thread, and a non-zero result of it
+ * ends training. Callable from any thread.
  *
  * @return NERTCA_ERROR_BUSY if it is already training in the background.
  *

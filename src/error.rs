@@ -24,6 +24,16 @@ pub enum Error {
         /// The reason of the refusal, and the accepted values.
         problem: String,
     },
+    /// The configuration cannot be used with the images of a dataset, though it could be with more or other images.
+    #[error("configuration: {field} = {value}: {problem}")]
+    Unmet {
+        /// Name of the key, as written in a TOML file; `dataset` where no key concerns it.
+        field: String,
+        /// The given value.
+        value: String,
+        /// The reason of the refusal, and the accepted images.
+        problem: String,
+    },
     /// An input file is malformed.
     #[error("{}: {field}: {problem}", file.display())]
     Data {
@@ -113,6 +123,11 @@ impl Error {
     /// Returns an [`Error::Data`] for `field` of `file`.
     pub fn data(file: impl AsRef<Path>, field: impl Into<String>, problem: impl Into<String>) -> Self {
         Error::Data { file: file.as_ref().to_path_buf(), field: field.into(), problem: problem.into() }
+    }
+
+    /// Returns an [`Error::Unmet`] for one key.
+    pub fn unmet(field: impl Into<String>, value: impl ToString, problem: impl Into<String>) -> Self {
+        Error::Unmet { field: field.into(), value: value.to_string(), problem: problem.into() }
     }
 
     /// Returns an [`Error::Config`] for one key.

@@ -141,6 +141,7 @@ pub mod import {
     pub mod stated;
     mod timing;
     mod traces;
+    pub mod views_file;
 }
 
 /// Evidence of each single view: its static background, its noise, and where vessels may be.

@@ -24,6 +24,7 @@ use crate::render::grid::PatientGrid;
 use crate::render::live::Source;
 use crate::render::quantity::Quantity;
 use crate::render::renderer::{Renderer, Rendering};
+use crate::scan::at_rest;
 use crate::scan::gating::{BeatTime, RPeaks};
 use crate::trees::extract::{TreeOptions, vessel_trees};
 use crate::trees::tree::BeatTree;
@@ -57,8 +58,11 @@ impl Session {
     ///
     /// # Errors
     /// [`Error::Config`] naming the option that no session could use.
-    pub fn new(gpu: Option<Gpu>, tuning: Option<Tuning>, options: SessionOptions) -> Result<Session> {
+    pub fn new(gpu: Option<Gpu>, tuning: Option<Tuning>, mut options: SessionOptions) -> Result<Session> {
         options.config.check()?;
+        if options.still {
+            options.phases = phases_at_rest(options.phases)?;
+        }
         if options.phases == 0 || options.phases > 4096 {
             return Err(Error::config("phases", options.phases, "is out of range: 1 to 4096 phases are accepted"));
         }
@@ -91,7 +95,7 @@ impl Session {
                 taken: Mutex::default(),
                 control: Mutex::new(Control {
                     state: State::Idle,
-                    failure: None,
+                    reason: None,
                     worker: None,
                     news: Instant::now(),
                     news_apart: Duration::MAX,
@@ -242,13 +246,23 @@ impl Session {
         self.shared.is_busy()
     }
 
-    /// Error that ended training in the background, if one did.
+    /// Returns the error that ended training in the background, if one did.
     pub fn failure(&self) -> Option<String> {
-        lock(&self.shared.control).failure.clone()
+        self.reason(State::Failed)
+    }
+
+    /// Returns the reason why training in the background waits for other frames, while it does.
+    pub fn waits_for(&self) -> Option<String> {
+        self.reason(State::Waiting)
+    }
+
+    fn reason(&self, of: State) -> Option<String> {
+        let control = lock(&self.shared.control);
+        control.reason.clone().filter(|_| control.state == of)
     }
 
     /// Trains up to `iterations` more, with the frames there are, and returns how many were done: fewer at the end of
-    /// the run, or when the observer ends it.
+    /// the run, or when the observer ends it, or [`Session::close`].
     ///
     /// # Errors
     /// [`Error::Busy`] while it trains already, [`Error::NotReady`] without frames enough, [`Error::NoDevice`];
@@ -280,7 +294,7 @@ impl Session {
                 (progress, engine.step() >= end)
             };
             let go_on = progress.is_none_or(|p| observe(&p));
-            if done || !go_on {
+            if done || !go_on || shared.long_work.is_closed() {
                 let mut engine = shared.visit();
                 shared.drain(&mut engine)?;
                 return Ok(engine.step() - first);
@@ -303,7 +317,7 @@ impl Session {
         shared.pause.store(false, Ordering::Release);
         {
             let mut control = lock(&shared.control);
-            (control.state, control.failure) = (State::Running, None);
+            (control.state, control.reason) = (State::Running, None);
         }
         let dispatch = tracing::dispatcher::get_default(Clone::clone);
         let spawned = std::thread::Builder::new().name(TRAINING_THREAD.into()).spawn(move || {
@@ -319,10 +333,10 @@ impl Session {
                 let mut control = lock(&shared.control);
                 control.worker = None;
                 match outcome {
-                    Ok(state) => control.state = state,
+                    Ok(state) => (control.state, control.reason) = (state, None),
                     Err(error) => {
                         tracing::error!("training in the background failed: {error}");
-                        (control.state, control.failure) = (State::Failed, Some(error.to_string()));
+                        (control.state, control.reason) = (State::Failed, Some(error.to_string()));
                     }
                 }
                 drop(control);
@@ -494,6 +508,22 @@ impl Session {
         self.shared.long_work.cancel();
     }
 
+    /// Ends training, in the background and in other threads, after the iterations under way, and long work in other threads as
+    /// [`Session::cancel`] does, also long work that begins later.
+    ///
+    /// # Errors
+    /// As [`Session::stop`].
+    pub fn close(&self) -> Result<()> {
+        self.stop()?;
+        self.shared.long_work.close();
+        Ok(())
+    }
+
+    /// Tells whether [`Session::close`] was called.
+    pub fn is_closed(&self) -> bool {
+        self.shared.long_work.is_closed()
+    }
+
     /// Calls a function before each slice of long work, in the thread that does the work, from the next call on: a place for work
     /// that must not wait.
     pub fn on_slices(&self, observer: Option<Arc<dyn Fn() + Send + Sync>>) {
@@ -523,12 +553,16 @@ impl Session {
         let model = &checkpoint.model;
         let mut engine = self.shared.visit();
         let mut inbox = lock(&self.shared.inbox);
-        let phases = model.param_map.phases as u32;
+        let (phases, still) = (model.param_map.phases as u32, model.scene.still);
         if inbox.options.phases != phases && !inbox.frames.is_empty() {
             let problem = format!("the session has frames of a beat of {} phases", inbox.options.phases);
             return Err(Error::config("checkpoint: phases", phases, problem));
         }
-        inbox.options.phases = phases;
+        if inbox.options.still != still && !inbox.frames.is_empty() {
+            let problem = format!("the session has frames of an object for which it is {}", inbox.options.still);
+            return Err(Error::config("checkpoint: still", still, problem));
+        }
+        (inbox.options.phases, inbox.options.still) = (phases, still);
         inbox.options.config = model.config.clone();
         engine.training = None;
         engine.version = 0;
@@ -539,6 +573,18 @@ impl Session {
         engine.saved = Some(checkpoint);
         Ok(())
     }
+}
+
+/// Returns the number of phases of an object at rest.
+///
+/// # Errors
+/// [`Error::Config`] where more are given.
+fn phases_at_rest(given: u32) -> Result<u32> {
+    if given > at_rest::PHASES {
+        let problem = "an object at rest has phase 0 and, where they are known, images without vessels as phase 1";
+        return Err(Error::config("phases", given, problem));
+    }
+    Ok(at_rest::PHASES)
 }
 
 /// Waits for the thread that trains; other callers that wait for it get the lock after that.

@@ -56,9 +56,6 @@ static TARGET: OnceLock<Target> = OnceLock::new();
 
 /// Chooses the parser of a name, and writes the files that it reads, made by the project's own writers, to `corpus/NAME`.
 pub fn begin(name: &str) {
-    // The fuzzer's hook would end the process on panics of decoders, too, which the parsers catch. Those that nobody catches
-    // end it afterwards.
-    std::panic::set_hook(Box::new(|panic| eprintln!("{panic}")));
     let parser = PARSERS.iter().chain(&STUDIES).find(|parser| parser.name == name).unwrap();
     let corpus = Path::new("corpus").join(name);
     std::fs::create_dir_all(&corpus).unwrap();

@@ -129,7 +129,9 @@ class _Core:
 class Reconstruction:
     """A reconstruction of the beating coronary arteries: its frames, its training, its fields.
 
-    phases: cardiac phases; 1 for a still object.
+    phases: cardiac phases; for an object at rest, 1, or 2 where frames of phase 1 show it without vessels.
+    still: whether the object is at rest, as in `dataset.json`: its vessels are seen by what stands out of each view, not by motion, and
+        the result has one phase, 0.
     preset: "fast", "fast-mlp", "paper", "public-code", "nerf-ca", "r2-gaussian", "x-gaussian" or "sax-nerf".
     depth_half_extent_mm: attenuation is searched within this distance of the isocentre plane; 100 when None.
     vessel_attenuation_per_mm: of filled vessels, where known: sets the Dice threshold.
@@ -144,6 +146,7 @@ class Reconstruction:
         self,
         phases: int,
         *,
+        still: bool = False,
         preset: Optional[str] = None,
         depth_half_extent_mm: Optional[float] = None,
         vessel_attenuation_per_mm: Optional[float] = None,
@@ -153,6 +156,7 @@ class Reconstruction:
         options = as_options(
             {
                 "phases": whole("phases", phases),
+                "still": True if still else None,
                 "preset": preset,
                 "depth_half_extent_mm": depth_half_extent_mm,
                 "vessel_attenuation_per_mm": vessel_attenuation_per_mm,

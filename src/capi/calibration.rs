@@ -2,8 +2,11 @@
 
 use crate::calibrate::choose::Correction;
 use crate::capi::reconstruction::{nertca_reconstruction, on_reconstruction};
-use crate::capi::status::nertca_status;
+use crate::capi::status::{Outcome, nertca_status};
 use crate::capi::types::{nertca_correction, nertca_geometry, read, write};
+use crate::error::Result;
+use crate::geometry::Geometry;
+use crate::session::{FrameUse, Session};
 
 /// The stated geometry of the frame is used.
 pub const NERTCA_CORRECTION_STATED: u32 = 0;
@@ -78,13 +81,10 @@ pub unsafe extern "C" fn nertca_reconstruction_set_geometry(
     frame: u32,
     geometry: *const nertca_geometry,
 ) -> nertca_status {
-    on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header requires that `geometry` is null or as long as its size says, and that its matrix is null or has
-        // 12 numbers.
-        let geometry = unsafe { read(geometry)?.geometry() }?;
-        reconstruction.session.set_geometry(frame as usize, geometry)?;
-        Ok(())
-    })
+    // SAFETY: the header requires the same of `geometry` as `with_geometry` does.
+    unsafe {
+        with_geometry(reconstruction, geometry, |session, geometry| session.set_geometry(frame as usize, geometry))
+    }
 }
 
 /// Sets another geometry for a frame and for all other frames of its view, as `nertca_reconstruction_set_geometry` does for one.
@@ -100,11 +100,25 @@ pub unsafe extern "C" fn nertca_reconstruction_set_view_geometry(
     frame: u32,
     geometry: *const nertca_geometry,
 ) -> nertca_status {
-    on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header requires that `geometry` is null or as long as its size says, and that its matrix is null or has
-        // 12 numbers.
+    // SAFETY: the header requires the same of `geometry` as `with_geometry` does.
+    unsafe {
+        with_geometry(reconstruction, geometry, |session, geometry| session.set_view_geometry(frame as usize, geometry))
+    }
+}
+
+/// Hands a caller's geometry to the session of a reconstruction.
+///
+/// # Safety
+/// `geometry` must be null or as long as its size says, and its matrix null or readable for 12 numbers.
+unsafe fn with_geometry(
+    reconstruction: *mut nertca_reconstruction,
+    geometry: *const nertca_geometry,
+    set: impl FnOnce(&Session, Geometry) -> Result<FrameUse>,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| -> Outcome<()> {
+        // SAFETY: callers of this function guarantee what it requires.
         let geometry = unsafe { read(geometry)?.geometry() }?;
-        reconstruction.session.set_view_geometry(frame as usize, geometry)?;
+        set(&reconstruction.session, geometry)?;
         Ok(())
     })
 }

@@ -15,6 +15,7 @@ use crate::capi::types::{
 use crate::checkpoint::Checkpoint;
 use crate::choice::Choice;
 use crate::config::{Config, Preset};
+use crate::scan::at_rest;
 use crate::scan::gating::RPeaks;
 use crate::session::{FrameUse, Progress, Session, SessionOptions};
 use crate::trees::tree::BeatTree;
@@ -63,6 +64,7 @@ fn session(context: &Context, mut options: Options) -> Outcome<Session> {
     let phases = options.take_as("phases", number)?;
     let depth = options.take_as("depth_half_extent_mm", number)?;
     let vessel = options.take_as("vessel_attenuation_per_mm", number)?;
+    let still = options.take_as("still", "true or false")?.unwrap_or(false);
     let preset = match options.take("preset") {
         None => None,
         Some(name) => Some(
@@ -73,10 +75,12 @@ fn session(context: &Context, mut options: Options) -> Outcome<Session> {
     let config = Config::load(preset, None, &options.settings())?;
     let options = SessionOptions {
         config,
-        phases: phases.ok_or_else(|| Failure::argument("phases", "is missing: give the number of cardiac phases"))?,
+        phases: phases
+            .or(still.then_some(at_rest::PHASES))
+            .ok_or_else(|| Failure::argument("phases", "is missing: give the number of cardiac phases"))?,
         depth_half_extent_mm: depth.unwrap_or(100.0),
         vessel_attenuation_per_mm: vessel,
-        still: false,
+        still,
         deterministic: context.deterministic,
     };
     Ok(Session::new(context.gpu.clone(), context.tuning.clone(), options)?)
@@ -84,7 +88,9 @@ fn session(context: &Context, mut options: Options) -> Outcome<Session> {
 
 /// Creates a reconstruction without frames.
 ///
-/// `options` are lines of `key = value` or a JSON object: `phases` (number of cardiac phases; required), `depth_half_extent_mm`
+/// `options` are lines of `key = value` or a JSON object: `phases` (number of cardiac phases; required, unless `still` is true), `still`
+/// (`true` for an object at rest, as in `dataset.json`: frames of phase 0 show it, and frames of phase 1 the same without vessels, which
+/// are estimated for views that have none; frames with a time need no R-peaks; the result has one phase, 0), `depth_half_extent_mm`
 /// (attenuation is searched within this distance of the isocentre plane; 100), `vessel_attenuation_per_mm` (attenuation of
 /// filled vessels, where known: sets the Dice threshold), `preset` (fast, fast-mlp, paper, public-code, nerf-ca, r2-gaussian,
 /// x-gaussian or sax-nerf) and every key that `nertca-vk train --print-config` shows, as in `train.iterations = 800`.
@@ -121,8 +127,9 @@ pub unsafe extern "C" fn nertca_reconstruction_create(
     })
 }
 
-/// Destroys a reconstruction: stops its training, waits for calls on it in other threads, and frees its memory. Null is
-/// allowed, and does nothing. Callable from any thread except inside its own callbacks.
+/// Destroys a reconstruction: stops its training, ends long calls on it in other threads, waits for all calls there, and frees its
+/// memory. `_train`, `_evaluate`, `_tree`, `_sample` and exact pictures under way return NERTCA_ERROR_CANCELLED, after the iterations
+/// or before the slice that they are at. Null is allowed, and does nothing. Callable from any thread except inside its own callbacks.
 ///
 /// @return NERTCA_ERROR_BUSY, with nothing done, from inside a callback of a call on it.
 ///
@@ -139,7 +146,7 @@ pub unsafe extern "C" fn nertca_reconstruction_destroy(reconstruction: *mut nert
         }
         let log = {
             let found = handles::get::<Reconstruction, _>(reconstruction)?;
-            found.session.stop()?;
+            found.session.close()?;
             found.claim.context.log.clone()
         };
         tracing::dispatcher::with_default(&log, || handles::remove::<Reconstruction, _>(reconstruction).map(drop))
@@ -312,8 +319,8 @@ pub unsafe extern "C" fn nertca_reconstruction_progress(
     })
 }
 
-/// Returns the reason why training in the background failed; empty when it did not. `text`, `size` and `length` work as in
-/// `nertca_last_error`. Callable from any thread.
+/// Returns the reason why training in the background failed, or, in the state NERTCA_STATE_WAITING, why it cannot go on with the frames
+/// there are; empty otherwise. `text`, `size` and `length` work as in `nertca_last_error`. Callable from any thread.
 ///
 /// # Safety
 /// `text` must hold `size` bytes; `length` must be writable or null.
@@ -325,7 +332,8 @@ pub unsafe extern "C" fn nertca_reconstruction_failure(
     length: *mut usize,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        let failure = reconstruction.session.failure().unwrap_or_default();
+        let session = &reconstruction.session;
+        let failure = session.failure().or_else(|| session.waits_for()).unwrap_or_default();
         // SAFETY: the header requires that `text` holds `size` bytes and that `length` is null or can be written.
         unsafe { copy_text(&failure, text, size, length) }
     })

@@ -74,7 +74,7 @@ impl From<Error> for Failure {
             Error::Diverged { .. } => NERTCA_ERROR_DIVERGED,
             Error::Interrupted => NERTCA_ERROR_CANCELLED,
             Error::Busy(_) => NERTCA_ERROR_BUSY,
-            Error::NotReady(_) => NERTCA_ERROR_NOT_READY,
+            Error::NotReady(_) | Error::Unmet { .. } => NERTCA_ERROR_NOT_READY,
             Error::Internal(_) => NERTCA_ERROR_INTERNAL,
         };
         Failure::new(status, error.to_string())

@@ -45,8 +45,9 @@ impl Callback {
 ///
 /// Only one such call at a time is allowed on a reconstruction; other threads may make all other calls meanwhile.
 ///
-/// @return NERTCA_ERROR_CANCELLED when the callback ended the call; NERTCA_ERROR_NOT_READY without enough frames;
-/// NERTCA_ERROR_BUSY while training in the background; NERTCA_ERROR_DIVERGED, with the last good state kept.
+/// @return NERTCA_ERROR_CANCELLED when the callback ended the call, or `nertca_reconstruction_destroy`; NERTCA_ERROR_NOT_READY without
+/// enough frames, or where the settings cannot be met with them; NERTCA_ERROR_BUSY while training in the background;
+/// NERTCA_ERROR_DIVERGED, with the last good state kept.
 ///
 /// # Safety
 /// `done` must be writable or null; `progress` must be callable with `user`.
@@ -72,12 +73,18 @@ pub unsafe extern "C" fn nertca_reconstruction_train(
             // SAFETY: the pointer is not null, and the header requires that it can be written.
             unsafe { done.write_unaligned(trained) };
         }
-        if cancelled { Err(crate::error::Error::Interrupted.into()) } else { Ok(()) }
+        if cancelled || reconstruction.session.is_closed() {
+            Err(crate::error::Error::Interrupted.into())
+        } else {
+            Ok(())
+        }
     })
 }
 
-/// Trains in the background until the run is complete, and waits for frames while there are too few. `progress` may be
-/// null; it is called on the training thread, and a non-zero result of it ends training. Callable from any thread.
+/// Trains in the background until the run is complete. While there are too few frames, or the settings cannot be met with those there
+/// are (nothing moves in them, for example), it waits for more or other ones in the state NERTCA_STATE_WAITING;
+/// `nertca_reconstruction_failure` tells why. `progress` may be null; it is called on the training thread, and a non-zero result of it
+/// ends training. Callable from any thread.
 ///
 /// @return NERTCA_ERROR_BUSY if it is already training in the background.
 ///

@@ -49,7 +49,7 @@ pub const NERTCA_STATE_IDLE: u32 = 0;
 pub const NERTCA_STATE_RUNNING: u32 = 1;
 /// Paused by `nertca_reconstruction_pause`.
 pub const NERTCA_STATE_PAUSED: u32 = 2;
-/// Waiting: training in the background starts as soon as there are enough frames.
+/// Waiting: training in the background goes on as soon as there are enough frames that the settings can be met with.
 pub const NERTCA_STATE_WAITING: u32 = 3;
 /// All iterations are done.
 pub const NERTCA_STATE_FINISHED: u32 = 4;

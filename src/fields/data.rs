@@ -81,7 +81,7 @@ impl FieldData {
     /// Collects the data of a fit in a scene.
     ///
     /// # Errors
-    /// [`Error::Config`] for a temporal target with a single phase.
+    /// [`Error::Unmet`] for a temporal target with a single phase.
     pub fn new(
         config: &Config,
         dataset: &Dataset,
@@ -99,7 +99,7 @@ impl FieldData {
         if compared && motion.iter().any(|m| m.n_phases < 2) {
             let problem = "needs several phases in every view; use `absolute` for static objects, and where the C-arm \
                            or the table moves";
-            return Err(Error::config("loss.dynamic_target", "temporal", problem));
+            return Err(Error::unmet("loss.dynamic_target", "temporal", problem));
         }
         let (pixels, training) = (dataset.n_pixels(), dataset.training());
         let params = ParamMap::new(config, dataset.n_phases as usize);

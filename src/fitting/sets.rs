@@ -18,7 +18,7 @@ impl Sets {
     /// Returns the sets of a static method. `key` is the name of its setting, for messages.
     ///
     /// # Errors
-    /// [`Error::Config`] where a phase needs a set and no image shows it.
+    /// [`Error::Unmet`] where a phase needs a set and no image shows it.
     pub(crate) fn of(dataset: &Dataset, static_data: StaticData, key: &str) -> Result<Sets> {
         let training = dataset.training();
         let of_phase = |phase: u32| (0..training.len()).filter(|i| training[*i].phase == phase).collect::<Vec<_>>();
@@ -29,7 +29,7 @@ impl Sets {
         let unseen: Vec<usize> = (0..sets.len()).filter(|phase| sets.images[*phase].is_empty()).collect();
         if !unseen.is_empty() {
             let problem = format!("no image shows the phases {unseen:?}: set {key} = \"pooled\"");
-            return Err(Error::config("dataset", dataset.path.display(), problem));
+            return Err(Error::unmet("dataset", dataset.path.display(), problem));
         }
         Ok(sets)
     }

@@ -1,5 +1,6 @@
 //! Transfer syntaxes, and images as they compress them: one frame of grey values at a time.
 
+use crate::formats::decoders::caught;
 use crate::import::elements::syntax;
 use hayro_jpeg2000::{DecodeSettings, DecoderContext, Image};
 use jpeg_decoder::{Decoder, PixelFormat, UnsupportedFeature};
@@ -21,6 +22,7 @@ pub(super) enum Codec {
     Native,
     Rle,
     Jpeg,
+    JpegLs,
     Jpeg2000,
 }
 
@@ -41,6 +43,8 @@ impl Codec {
             | "1.2.840.10008.1.2.4.55"
             | "1.2.840.10008.1.2.4.57"
             | "1.2.840.10008.1.2.4.70" => Ok(Codec::Jpeg),
+            // Lossless, and near-lossless.
+            "1.2.840.10008.1.2.4.80" | "1.2.840.10008.1.2.4.81" => Ok(Codec::JpegLs),
             // Lossless, and either.
             "1.2.840.10008.1.2.4.90" | "1.2.840.10008.1.2.4.91" => Ok(Codec::Jpeg2000),
             other => Err(not_read(other)),
@@ -51,7 +55,7 @@ impl Codec {
     pub(super) fn first_marker(self) -> Option<[u8; 2]> {
         match self {
             Codec::Native | Codec::Rle => None,
-            Codec::Jpeg => Some([0xff, 0xd8]),
+            Codec::Jpeg | Codec::JpegLs => Some([0xff, 0xd8]),
             Codec::Jpeg2000 => Some(START_OF_CODESTREAM),
         }
     }
@@ -64,23 +68,16 @@ impl Codec {
         match self {
             Codec::Native => native(bytes, size[0] * size[1], bytes_per_value, false),
             Codec::Rle => rle(bytes, size[0] * size[1], bytes_per_value),
-            Codec::Jpeg => caught(|| jpeg(bytes, size)),
-            Codec::Jpeg2000 => caught(|| jpeg2000(bytes, size)),
+            Codec::Jpeg => caught(|| jpeg(bytes, size))?,
+            Codec::JpegLs => caught(|| jpeg_ls(bytes, size))?,
+            Codec::Jpeg2000 => caught(|| jpeg2000(bytes, size))?,
         }
     }
-}
-
-/// Runs a decoder of others, which may panic on a damaged image; that becomes an error of the file.
-fn caught(decode: impl FnOnce() -> Result<Vec<u32>, String>) -> Result<Vec<u32>, String> {
-    let decoded = std::panic::catch_unwind(std::panic::AssertUnwindSafe(decode));
-    decoded.unwrap_or_else(|_| Err("its image is damaged, and the decoder failed on it".into()))
 }
 
 /// Sentence about a codec that is not read.
 fn not_read(uid: &str) -> String {
     let (name, tool) = match uid {
-        "1.2.840.10008.1.2.4.80" => ("JPEG-LS", "dcmdjpls"),
-        "1.2.840.10008.1.2.4.81" => ("JPEG-LS near-lossless", "dcmdjpls"),
         "1.2.840.10008.1.2.4.92" | "1.2.840.10008.1.2.4.93" => ("JPEG 2000 with several components", "gdcmconv --raw"),
         "1.2.840.10008.1.2.4.201" | "1.2.840.10008.1.2.4.202" | "1.2.840.10008.1.2.4.203" => {
             ("High-Throughput JPEG 2000", "gdcmconv --raw")
@@ -182,6 +179,13 @@ fn jpeg(bytes: &[u8], size: [usize; 2]) -> Result<Vec<u32>, String> {
         PixelFormat::L8 => values.into_iter().map(u32::from).collect(),
         _ => values.chunks_exact(2).map(|pair| u16::from_ne_bytes([pair[0], pair[1]]).into()).collect(),
     })
+}
+
+fn jpeg_ls(bytes: &[u8], [width, height]: [usize; 2]) -> Result<Vec<u32>, String> {
+    // The decoder compares the sizes before it reserves memory.
+    let decoded = jpegls::decode(bytes, width as u32, height as u32);
+    let (values, ..) = decoded.map_err(|error| format!("its JPEG-LS image cannot be decoded: {error}"))?;
+    Ok(values.into_iter().map(u32::from).collect())
 }
 
 fn jpeg2000(bytes: &[u8], size: [usize; 2]) -> Result<Vec<u32>, String> {

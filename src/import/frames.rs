@@ -1,5 +1,6 @@
 //! Pixel data: which fragments belong to which frame, and the values of frames as they are stored.
 
+use crate::formats::decoders;
 use crate::import::codecs::{Codec, native};
 use crate::import::elements::{DataSet, Element, Fragments, Value, numbers};
 use dicom_core::VR;
@@ -64,7 +65,8 @@ pub(super) fn decode(
                 values.map_err(|problem| format!("frame {}: {problem}", i + 1))
             };
             // The first frame that is damaged is named, whichever is decoded first.
-            let decoded: Vec<Result<Vec<u32>, String>> = frames.par_iter().enumerate().map(decode).collect();
+            let decoded: Vec<Result<Vec<u32>, String>> =
+                decoders::caught(|| frames.par_iter().enumerate().map(decode).collect())?;
             decoded.into_iter().collect::<Result<_, String>>()?
         }
         Value::Bytes { bytes, .. } if codec == Codec::Native => uncompressed(bytes, element, layout)?,

@@ -16,7 +16,7 @@ const MAX_FRAMES: usize = 2000;
 pub struct PictureView {
     /// Folder with one picture per frame, in the order of their names, or a file with one or more frames.
     pub path: PathBuf,
-    /// C-arm of all frames; the detector is centred.
+    /// C-arm of all frames.
     pub c_arm: CArm,
     /// Frames per second; none where times are not known.
     pub frames_per_s: Option<f64>,

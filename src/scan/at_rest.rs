@@ -1,7 +1,9 @@
 //! Objects at rest: the appearance of a view without vessels, as in subtraction angiography, so that the rest of the engine sees
 //! vessels that appear and vanish.
 
+use crate::geometry::MM_PER_UNIT;
 use crate::raster::{Image, dilate, opening, percentile};
+use crate::scan::dataset::{Frame, Split, View};
 
 /// Width of the widest vessel that is searched, mm at the isocentre.
 pub const WIDEST_VESSEL_MM: f64 = 6.0;
@@ -30,6 +32,43 @@ pub(crate) fn without_vessels(image: &Image, vessel: usize, dark: f32) -> Image 
         *b = if stand_out[p] > limit && !closed[p] { *b + typical } else { image.values[p] };
     }
     background
+}
+
+/// Adds a training frame of phase 1 for each view of an object at rest that has none: the mean of its images without structures as
+/// thin as vessels. The frames have the sizes of their views. Returns a note if there are such views.
+pub(crate) fn add_appearance_without_vessels(views: &[View], frames: &mut Vec<Frame>) -> Option<String> {
+    let mut made = 0;
+    for (index, view) in views.iter().enumerate() {
+        let of_view = |phase: u32| {
+            let used = move |f: &&Frame| (f.view, f.split, f.phase) == (index, Split::Train, phase);
+            frames.iter().filter(used)
+        };
+        let shown: Vec<&Frame> = of_view(0).collect();
+        if shown.is_empty() || of_view(1).next().is_some() {
+            continue;
+        }
+        let [width, height] = view.size;
+        let mut mean = Image::zeros(width, height);
+        for frame in &shown {
+            mean.values.iter_mut().zip(&frame.integrals).for_each(|(sum, v)| *sum += v / shown.len() as f32);
+        }
+        let pixel_mm = view.rays.direction[1].length() * view.rays.sod * MM_PER_UNIT;
+        let background = without_vessels(&mean, vessel_pixels(pixel_mm), f32::INFINITY);
+        let frame = Frame {
+            name: format!("{}-without-vessels", shown[0].name),
+            phase: 1,
+            integrals: background.values,
+            mask: None,
+            ..shown[0].clone()
+        };
+        frames.push(frame);
+        made += 1;
+    }
+    let note = format!(
+        "the object is at rest: the appearance of {made} views without vessels was estimated from their images, without structures up \
+         to {WIDEST_VESSEL_MM} mm wide"
+    );
+    (made > 0).then_some(note)
 }
 
 /// Pixels within `margin` of the image's edge, or of dark areas.

@@ -1,9 +1,9 @@
 //! Collects the frames of a dataset that is read, and checks each one.
 
 use crate::error::{Error, Result};
-use crate::geometry::{Geometry, MM_PER_UNIT};
+use crate::geometry::Geometry;
 use crate::raster::Image;
-use crate::scan::at_rest::{self, WIDEST_VESSEL_MM, vessel_pixels, without_vessels};
+use crate::scan::at_rest;
 use crate::scan::canvas::onto_canvas;
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use crate::scan::frame_checks::{Complaint, check_phase, check_values};
@@ -126,47 +126,9 @@ impl Builder {
         Ok(())
     }
 
-    /// Adds a training frame of phase 1 for each view of an object at rest that has none: the mean of its images without
-    /// structures as thin as vessels.
-    fn add_appearance_without_vessels(&mut self) {
-        let mut made = 0;
-        for (index, view) in self.views.iter().enumerate() {
-            let of_view = |phase: u32| {
-                let used = move |f: &&Frame| (f.view, f.split, f.phase) == (index, Split::Train, phase);
-                self.frames.iter().filter(used)
-            };
-            let shown: Vec<&Frame> = of_view(0).collect();
-            if shown.is_empty() || of_view(1).next().is_some() {
-                continue;
-            }
-            let [width, height] = view.size;
-            let mut mean = Image::zeros(width, height);
-            for frame in &shown {
-                mean.values.iter_mut().zip(&frame.integrals).for_each(|(sum, v)| *sum += v / shown.len() as f32);
-            }
-            let pixel_mm = view.rays.direction[1].length() * view.rays.sod * MM_PER_UNIT;
-            let background = without_vessels(&mean, vessel_pixels(pixel_mm), f32::INFINITY);
-            let frame = Frame {
-                name: format!("{}-without-vessels", shown[0].name),
-                phase: 1,
-                integrals: background.values,
-                mask: None,
-                ..shown[0].clone()
-            };
-            self.frames.push(frame);
-            made += 1;
-        }
-        if made > 0 {
-            self.notes.push(format!(
-                "the object is at rest: the appearance of {made} views without vessels was estimated from their images, \
-                 without structures up to {WIDEST_VESSEL_MM} mm wide"
-            ));
-        }
-    }
-
     pub(super) fn finish(mut self, path: &Path, layout: Layout) -> Result<Dataset> {
         if self.still {
-            self.add_appearance_without_vessels();
+            self.notes.extend(at_rest::add_appearance_without_vessels(&self.views, &mut self.frames));
         }
         let canvas = onto_canvas(&self.views, &mut self.frames);
         let canvas = canvas.map_err(|c| Error::data(&self.file, "frames", format!("{}: {}", c.value, c.problem)))?;

@@ -30,6 +30,8 @@ const SETTLE: u32 = 4;
 const QUIET: Duration = Duration::from_millis(200);
 /// Number of intervals between the last frames without a new one after which a run counts as over.
 const MISSED_FRAMES: u32 = 3;
+/// Interval at which training that waits for frames looks whether it is to pause.
+const WAITING: Duration = Duration::from_secs(1);
 /// Interval at which training looks again while others wait for the engine.
 const GIVE_WAY: Duration = Duration::from_micros(200);
 
@@ -123,7 +125,8 @@ pub struct Drawn {
 /// State of training, for those who wait for it.
 pub(super) struct Control {
     pub(super) state: State,
-    pub(super) failure: Option<String>,
+    /// Reason why training in the background failed, or why it waits.
+    pub(super) reason: Option<String>,
     pub(super) worker: Option<ThreadId>,
     /// When frames or R-peaks came last.
     pub(super) news: Instant,
@@ -501,20 +504,29 @@ impl Shared {
             if engine.version != version && self.has_settled(&engine) {
                 match self.take_in_frames(&mut engine, || self.set_state(State::Running)) {
                     Ok(()) => (),
-                    Err(Error::NotReady(why)) => {
+                    // The frames are too few, or the settings cannot be met with them: more frames may change that.
+                    Err(why @ (Error::NotReady(_) | Error::Unmet { .. } | Error::Data { .. })) => {
                         // Frames may have been removed, or have other geometry: the field so far is kept.
                         self.drain(&mut engine)?;
                         drop(engine);
                         tracing::info!("waiting for frames: {why}");
-                        self.wait_for_frames(version);
+                        self.wait_for_frames(version, &why);
                         continue;
                     }
                     Err(error) => return Err(error),
                 }
             }
             self.set_state(State::Running);
-            let length = engine.length();
-            let progress = self.advance(&mut engine, length)?;
+            let (length, taken) = (engine.length(), engine.version);
+            let progress = match self.advance(&mut engine, length) {
+                Err(why @ Error::Unmet { .. }) => {
+                    drop(engine);
+                    tracing::info!("waiting for frames: {why}");
+                    self.wait_for_frames(taken, &why);
+                    continue;
+                }
+                advanced => advanced?,
+            };
             let at_end = engine.step() >= length;
             let done = at_end && engine.version == version;
             drop(engine);
@@ -532,15 +544,21 @@ impl Shared {
         }
     }
 
-    /// Waits until the frames are no longer those of `version`.
-    fn wait_for_frames(&self, version: u64) {
+    /// Waits until the frames are no longer those of `version`, with which training cannot go on.
+    fn wait_for_frames(&self, version: u64, why: &Error) {
         self.stop_renewing();
         {
             let mut control = lock(&self.control);
             (control.state, control.waits_at) = (State::Waiting, version);
+            control.reason = Some(why.to_string());
         }
         self.changed.notify_all();
-        self.rest(Duration::from_secs(60), || self.version.load(Ordering::Acquire) == version);
+        let unchanged = || self.version.load(Ordering::Acquire) == version;
+        let asked = || self.stop.load(Ordering::Acquire) || self.pause.load(Ordering::Acquire);
+        while unchanged() && !asked() {
+            self.rest(WAITING, unchanged);
+        }
+        lock(&self.control).reason = None;
     }
 
     /// Tells whether training in the background has something to do: it trains, plans, or has not yet looked at the newest frames.

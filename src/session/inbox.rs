@@ -3,6 +3,7 @@
 use crate::config::{Config, DynamicTarget};
 use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT};
+use crate::scan::at_rest;
 use crate::scan::canvas::onto_canvas;
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use crate::scan::frame_checks::{Complaint, check_phase, check_values};
@@ -16,13 +17,14 @@ use std::path::PathBuf;
 pub struct SessionOptions {
     /// Hyper-parameters.
     pub config: Config,
-    /// Cardiac phases; 1 for a still object.
+    /// Cardiac phases; 1 or 2 for an object at rest, which has two in the session.
     pub phases: u32,
     /// Attenuation is searched within this distance before and behind the isocentre plane, mm.
     pub depth_half_extent_mm: f64,
     /// Attenuation of contrast-filled vessels, 1/mm, where known; a fifth of it is the Dice threshold.
     pub vessel_attenuation_per_mm: Option<f64>,
-    /// Whether the object is at rest: frames of phase 0 show it, and those of phase 1 the same without vessels, of two phases.
+    /// Whether the object is at rest: frames of phase 0, and frames with a time in seconds, show it, and those of phase 1 the same
+    /// without vessels. Phase 1 is estimated for views without a frame of it.
     pub still: bool,
     /// Refuse frames while training in the background, so that results never depend on timing.
     pub deterministic: bool,
@@ -129,6 +131,10 @@ impl Inbox {
                     "is out of range: -0.5 to 0.5 phases after the nearest phase are accepted".into(),
                 ));
             }
+            FrameTime::Beat(BeatTime { after_phase, .. }) if self.options.still && after_phase != 0.0 => {
+                let problem = "lies between two phases, which an object at rest does not";
+                return Err(bad("time", after_phase.to_string(), problem.into()));
+            }
             FrameTime::Beat(taken) => check_phase(taken.phase.into(), self.options.phases).map_err(told)?,
             FrameTime::TimeS(time) if !time.is_finite() => {
                 return Err(bad("time", time.to_string(), "is not a time in seconds".into()));
@@ -216,6 +222,13 @@ impl Inbox {
                 known.entry(kept.frame.view).or_default().insert(taken.phase);
             }
         }
+        if self.options.still {
+            // The other phase is estimated from the first.
+            known
+                .values_mut()
+                .filter(|phases| phases.contains(&0))
+                .for_each(|phases| phases.extend(0..at_rest::PHASES));
+        }
         known
     }
 
@@ -242,6 +255,7 @@ impl Inbox {
         match (moment, &self.r_peaks) {
             (FrameTime::Phase(phase), _) => Some(BeatTime::at_phase(phase)),
             (FrameTime::Beat(taken), _) => Some(taken),
+            (FrameTime::TimeS(_), _) if self.options.still => Some(BeatTime::at_phase(0)),
             (FrameTime::TimeS(time), Some(peaks)) => peaks.beat_time(time, self.options.phases, BeatScaling::default()),
             (FrameTime::TimeS(_), None) => None,
         }
@@ -257,6 +271,10 @@ impl Inbox {
             let BeatTime { phase, after_phase } = beat_time;
             frames.push(Frame { phase, after_phase, ..kept.frame.clone() });
             taken.push((index, beat_time, kept.frame.view, kept.change));
+        }
+        let mut notes = Vec::new();
+        if self.options.still {
+            notes.extend(at_rest::add_appearance_without_vessels(&self.views, &mut frames));
         }
         frames.sort_by_key(|f| f.split);
         let Some([width, height]) = onto_canvas(&self.views, &mut frames).map_err(told)? else {
@@ -275,7 +293,7 @@ impl Inbox {
             depth_range: (-half, half),
             vessel_attenuation: self.options.vessel_attenuation_per_mm.map(|a| a * MM_PER_UNIT),
             still: self.options.still,
-            notes: Vec::new(),
+            notes,
         };
         dataset.hide();
         Ok((dataset, taken))

@@ -5,24 +5,32 @@ use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::render::live::Live;
 use crate::render::renderer::Interlude;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Function that is called between slices.
 pub(super) type SliceObserver = Arc<dyn Fn() + Send + Sync>;
 
+/// Cancellations of the long work of a session.
+#[derive(Default)]
+struct Cancelled {
+    /// Number of times that work under way was cancelled.
+    times: AtomicU64,
+    /// Whether all work, also that which begins later, is cancelled.
+    for_good: AtomicBool,
+}
+
 /// Long work of a session.
 #[derive(Default)]
 pub(super) struct LongWork {
-    /// Number of times that work under way was cancelled.
-    cancelled: Arc<AtomicU64>,
+    cancelled: Arc<Cancelled>,
     observer: Mutex<Option<SliceObserver>>,
 }
 
 /// A call that does long work.
 #[derive(Clone)]
 pub(super) struct LongCall {
-    cancelled: Arc<AtomicU64>,
+    cancelled: Arc<Cancelled>,
     cancelled_before: u64,
     observer: Option<SliceObserver>,
 }
@@ -41,14 +49,24 @@ impl LongWork {
     pub(super) fn begin(&self) -> LongCall {
         LongCall {
             cancelled: self.cancelled.clone(),
-            cancelled_before: self.cancelled.load(Ordering::Acquire),
+            cancelled_before: self.cancelled.times.load(Ordering::Acquire),
             observer: self.observer.lock().unwrap_or_else(PoisonError::into_inner).clone(),
         }
     }
 
     /// Ends the calls under way at their next slices.
     pub(super) fn cancel(&self) {
-        self.cancelled.fetch_add(1, Ordering::AcqRel);
+        self.cancelled.times.fetch_add(1, Ordering::AcqRel);
+    }
+
+    /// Ends the calls under way at their next slices, and calls that begin later at their first.
+    pub(super) fn close(&self) {
+        self.cancelled.for_good.store(true, Ordering::Release);
+    }
+
+    /// Tells whether all work is cancelled.
+    pub(super) fn is_closed(&self) -> bool {
+        self.cancelled.for_good.load(Ordering::Acquire)
     }
 
     /// Sets the function that is called between the slices of calls that begin later.
@@ -77,7 +95,8 @@ impl LongCall {
     /// # Errors
     /// [`Error::Interrupted`].
     pub(super) fn check(&self) -> Result<()> {
-        let cancelled = self.cancelled.load(Ordering::Acquire) != self.cancelled_before;
-        if cancelled { Err(Error::Interrupted) } else { Ok(()) }
+        let Cancelled { times, for_good } = &*self.cancelled;
+        let is_cancelled = times.load(Ordering::Acquire) != self.cancelled_before || for_good.load(Ordering::Acquire);
+        if is_cancelled { Err(Error::Interrupted) } else { Ok(()) }
     }
 }

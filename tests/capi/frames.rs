@@ -8,6 +8,10 @@ use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::*;
 use nertca_vk::capi::training::*;
 use nertca_vk::capi::types::*;
+use nertca_vk::formats::npy;
+use nertca_vk::geometry::{CArm, Geometry};
+use nertca_vk::scan::dataset::Dataset;
+use std::ffi::CStr;
 use std::ptr::{null, null_mut};
 use std::time::Duration;
 
@@ -183,6 +187,131 @@ fn training_waits_when_frames_become_too_few_and_goes_on_when_they_come() {
     ok(nertca_reconstruction_stop(made), made);
     assert_eq!(progress(made).state, NERTCA_STATE_IDLE);
     close(context, &[made]);
+}
+
+fn failure_of(reconstruction: *mut nertca_reconstruction) -> String {
+    let mut text = [0; 1024];
+    let written = unsafe { nertca_reconstruction_failure(reconstruction, text.as_mut_ptr(), text.len(), &mut 0) };
+    ok(written, reconstruction);
+    unsafe { CStr::from_ptr(text.as_ptr()) }.to_str().unwrap().to_owned()
+}
+
+#[test]
+fn training_waits_for_frames_that_the_settings_can_be_met_with() {
+    let context = context("validation = true");
+    let made = reconstruction(context, SMALL);
+    // Contrast has not come yet: the frames of a view are alike.
+    for view in 0..2 {
+        for phase in 0..PHASES {
+            let blank = vec![0.8; (SIZE * SIZE) as usize];
+            ok(unsafe { nertca_reconstruction_add_frame(made, &frame(view, phase, &blank)) }, made);
+        }
+    }
+    let status = unsafe { nertca_reconstruction_train(made, 1, None, null_mut(), null_mut()) };
+    assert_eq!(status, NERTCA_ERROR_NOT_READY, "{}", last_error(made));
+    ok(unsafe { nertca_reconstruction_start(made, None, null_mut()) }, made);
+    wait_until("waiting for frames", || progress(made).state == NERTCA_STATE_WAITING);
+    assert!(failure_of(made).contains("nothing changes over the beat"), "{}", failure_of(made));
+    add_frames(made, 0..3);
+    wait_until("training with all frames", || progress(made).step > 0);
+    assert_eq!(failure_of(made), "");
+    ok(nertca_reconstruction_stop(made), made);
+    assert_eq!((progress(made).state, failure_of(made)), (NERTCA_STATE_IDLE, String::new()));
+    close(context, &[made]);
+}
+
+#[test]
+fn a_method_that_needs_all_phases_waits_for_the_last() {
+    let context = context("validation = true");
+    let made = reconstruction(context, "phases = 3\npreset = r2-gaussian\ntrain.iterations = 20");
+    let add = |phases: std::ops::Range<u32>| {
+        for (view, phase) in phases.flat_map(|phase| (0..3).map(move |view| (view, phase))) {
+            let pixels = pixels(view, phase);
+            ok(unsafe { nertca_reconstruction_add_frame(made, &frame(view, phase, &pixels)) }, made);
+        }
+    };
+    add(0..2);
+    ok(unsafe { nertca_reconstruction_start(made, None, null_mut()) }, made);
+    wait_until("waiting for frames", || progress(made).state == NERTCA_STATE_WAITING);
+    assert!(failure_of(made).contains("no image shows the phases [2]"), "{}", failure_of(made));
+    add(2..3);
+    wait_until("training with all phases", || progress(made).step > 0);
+    ok(nertca_reconstruction_stop(made), made);
+    close(context, &[made]);
+}
+
+#[test]
+fn training_in_another_thread_ends_when_its_reconstruction_is_destroyed() {
+    let context = context("validation = true");
+    let made = reconstruction(context, &SMALL.replace("train.iterations = 60", "train.iterations = 1000000"));
+    add_frames(made, 0..3);
+    let handle = made.addr();
+    let training = std::thread::spawn(move || {
+        let made = std::ptr::with_exposed_provenance_mut(handle);
+        let mut done = 0;
+        (unsafe { nertca_reconstruction_train(made, 1_000_000, None, null_mut(), &mut done) }, done)
+    });
+    wait_until("training", || progress(made).step > 0);
+    ok(unsafe { nertca_reconstruction_destroy(made) }, made);
+    let (status, done) = training.join().unwrap();
+    assert_eq!(status, NERTCA_ERROR_CANCELLED);
+    assert!((1..1_000_000).contains(&done), "{done}");
+    close(context, &[]);
+}
+
+/// Line integrals of a thin vessel along the axis of the patient, which all views show in their middle, on a gradient.
+fn vessel_at_rest() -> Vec<f32> {
+    let at = |p: u32| (p % SIZE, p / SIZE);
+    let is_vessel = |x: u32, y: u32| (9..11).contains(&x) && (5..15).contains(&y);
+    let value = |(x, y): (u32, u32)| 0.8 + 0.01 * x as f32 + if is_vessel(x, y) { 0.5 } else { 0.0 };
+    (0..SIZE * SIZE).map(at).map(value).collect()
+}
+
+/// Images without vessels that a dataset of the same views has, whose manifest says that the object is at rest.
+fn appearance_without_vessels() -> Vec<Vec<f32>> {
+    let directory = tempfile::tempdir().unwrap();
+    let image = vessel_at_rest();
+    npy::write(&directory.path().join("i.npy"), &[SIZE as usize, SIZE as usize], &image).unwrap();
+    let frame = |view: usize| {
+        let nertca_geometry { primary_deg, secondary_deg, sid_mm, sod_mm, pixel_mm, .. } = geometry(view);
+        let (offset_mm, table_mm) = ([0.0; 2], [0.0; 3]);
+        let c_arm = CArm { primary_deg, secondary_deg, sid_mm, sod_mm, pixel_mm, offset_mm, table_mm };
+        serde_json::json!({"image": "i.npy", "phase": 0, "split": "train", "intensity": {"kind": "integral"}, "geometry": Geometry::CArm(c_arm)})
+    };
+    let manifest = serde_json::json!({"format": "nertca-dataset", "version": 1, "phases": 1, "still": true, "depth_half_extent_mm": 90,
+        "vessel_attenuation_per_mm": 0.01, "frames": [frame(0), frame(1), frame(2)]});
+    std::fs::write(directory.path().join("dataset.json"), manifest.to_string()).unwrap();
+    let dataset = Dataset::open(directory.path()).unwrap();
+    let estimated: Vec<_> = dataset.frames.iter().filter(|f| f.phase == 1).map(|f| f.integrals.clone()).collect();
+    assert!(estimated.len() == 3 && estimated.iter().all(|f| *f != image));
+    estimated
+}
+
+#[test]
+fn an_object_at_rest_is_reconstructed_as_the_same_dataset_is() {
+    let context = context("validation = true\ndeterministic = true");
+    let options = SMALL.replace("phases = 3", "still = true");
+    let (estimating, given) = (reconstruction(context, &options), reconstruction(context, &options));
+    let image = vessel_at_rest();
+    for view in 0..3 {
+        // A frame needs no phase.
+        let timed = nertca_frame { phase: -1, time_s: 0.3 * view as f64, ..frame(view, 0, &image) };
+        ok(unsafe { nertca_reconstruction_add_frame(estimating, &timed) }, estimating);
+        ok(unsafe { nertca_reconstruction_add_frame(given, &frame(view, 0, &image)) }, given);
+    }
+    assert_eq!(uses(estimating, 0..3), [0, 1, 2].map(|view| (view, NERTCA_USE_TRAINING, 0)));
+    for (view, background) in appearance_without_vessels().iter().enumerate() {
+        ok(unsafe { nertca_reconstruction_add_frame(given, &frame(view, 1, background)) }, given);
+    }
+    train(estimating, 5);
+    train(given, 5);
+    assert!(bytes_of(estimating) == bytes_of(given), "the estimated images are those of the dataset");
+    let middle = |picture: Vec<f32>| picture[(SIZE * SIZE / 2 + SIZE / 2) as usize];
+    let moving = |phase| nertca_view { component: NERTCA_COMPONENT_DYNAMIC, ..view(phase) };
+    assert!(middle(drawn(estimating, &moving(0))) > 0.0, "the vessel is seen");
+    let third = frame(0, 2, &image);
+    assert_eq!(unsafe { nertca_reconstruction_add_frame(given, &third) }, NERTCA_ERROR_ARGUMENT, "no third phase");
+    close(context, &[estimating, given]);
 }
 
 #[test]

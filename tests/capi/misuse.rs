@@ -207,6 +207,8 @@ fn reconstructions(b: &Bench) {
         ("phases = 0", "phases"),
         ("phases = 1.5", "phases"),
         ("phases = 99999", "phases"),
+        ("still = true\nphases = 3", "phases"),
+        ("phases = 2\nstill = perhaps", "still"),
         ("phases = 3\ndepth_half_extent_mm = nan", "depth_half_extent_mm"),
         ("phases = 3\ndepth_half_extent_mm = -2", "depth_half_extent_mm"),
         ("phases = 3\nvessel_attenuation_per_mm = 0", "vessel_attenuation_per_mm"),

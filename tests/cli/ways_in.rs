@@ -117,6 +117,98 @@ fn pictures_become_a_dataset_by_options_alone() {
     fails(&[&["import", "pictures", text(&empty), "-o", text(&none)], &one[..], &alone].concat(), 1, &["2.png", "10"]);
 }
 
+#[test]
+fn a_file_states_what_options_state_of_pictures() {
+    let directory = tempfile::tempdir().unwrap();
+    let to = |name: &str| directory.path().join(name);
+    let made = python().args(["-c", PICTURES, text(directory.path())]).output().unwrap();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let (png, jpg, file) = (to("png"), to("jpg"), to("views.toml"));
+    let write = |content: &str| std::fs::write(&file, content).unwrap();
+    let contents = |out: &Path| {
+        let mut files: Vec<(PathBuf, Vec<u8>)> = std::fs::read_dir(out.join("images"))
+            .unwrap()
+            .map(|entry| entry.unwrap().path())
+            .map(|path| (path.file_name().unwrap().into(), std::fs::read(&path).unwrap()))
+            .collect();
+        files.sort();
+        (manifest(out), files)
+    };
+    let peaks = to("peaks.txt");
+    std::fs::write(&peaks, "0\n0.3\n0.6\n").unwrap();
+    let by_options =
+        ["--sid", "1000,1100", "--sod", "750", "--pixel", "2,2.5", "--angles", "-30,20;40,-10", "--fps", "10"];
+    let common = ["--phases", "3", "--frames", "1-6"];
+    let (options, by_file) = (to("options"), to("by-file"));
+    let given = ["import", "pictures", text(&png), text(&jpg), "-o", text(&options), "--r-peaks", text(&peaks)];
+    ok(&[&given[..], &by_options, &common].concat());
+    write(VIEWS);
+    let import = |out: &Path, more: &[&str]| {
+        let words = ["import", "pictures", "--geometry", text(&file), "-o", text(out)];
+        [&words[..], &common, more].concat().into_iter().map(str::to_owned).collect::<Vec<_>>()
+    };
+    let run = |out: &Path, more: &[&str]| ok(&import(out, more).iter().map(String::as_str).collect::<Vec<_>>());
+    run(&by_file, &[]);
+    assert_eq!(contents(&by_file), contents(&options));
+    // An option that states phases takes precedence, and a cropped picture keeps its place on the detector.
+    write(
+        &VIEWS
+            .replace("r_peaks_s = [0, 0.3, 0.6]\n", "")
+            .replace("angles_deg = [40, -10]", "angles_deg = [40, -10]\noffset_mm = [3, -1]"),
+    );
+    let cropped = to("cropped");
+    run(&cropped, &["--r-peaks", text(&peaks)]);
+    assert_eq!(manifest(&cropped)["frames"][3]["geometry"]["offset_mm"], json!([3.0, -1.0]));
+    // An object at rest.
+    write(&format!("still = true\n{}", VIEWS.replace("r_peaks_s = [0, 0.3, 0.6]\n", "")));
+    let (rest, rest_by_options) = (to("rest"), to("rest-by-options"));
+    run(&rest, &[]);
+    let given = ["import", "pictures", text(&png), text(&jpg), "-o", text(&rest_by_options), "--still"];
+    ok(&[&given[..], &by_options, &common].concat());
+    assert_eq!(contents(&rest), contents(&rest_by_options));
+    assert_eq!(manifest(&rest)["still"], json!(true));
+
+    let none = to("none");
+    let refused = |from: &str, with: &str, parts: &[&str]| {
+        assert!(VIEWS.contains(from), "{from}");
+        write(&VIEWS.replacen(from, with, 1));
+        let words = import(&none, &[]);
+        let parts: Vec<&str> = ["views.toml"].into_iter().chain(parts.iter().copied()).collect();
+        fails(&words.iter().map(String::as_str).collect::<Vec<_>>(), 1, &parts);
+        assert!(!none.exists(), "{with} leaves something behind");
+    };
+    refused("sid_mm = 1100", "sid_mm = 0", &["view 2: sid_mm"]);
+    refused("sid_mm = 1100", "sid = 1100", &["line 14", "sid"]);
+    refused("sod_mm = 750", "", &["view 1: sod_mm: is missing"]);
+    refused("pixel_mm = [2, 2.5]", "pixel_mm = [2]", &["line 3", "two numbers"]);
+    refused("fps = 10", "fps = -10", &["view 1: fps: -10"]);
+    refused("[0, 0.3, 0.6]", "[0, 0.3, 0.1]", &["view 1: r_peaks_s", "0.1"]);
+    refused("[all]", "still = true\n[all]", &["view 1: r_peaks_s", "still = true"]);
+    refused("angles_deg = [-30, 20]", "angles_deg = [-30, 20]\nphases = [0]", &["view 1: r_peaks_s", "phases"]);
+    refused("angles_deg = [-30, 20]", "", &["angles_deg"]);
+    fails(&["import", "pictures", text(&png), "--geometry", text(&file), "-o", text(&none)], 2, &["--geometry"]);
+    fails(&["import", "pictures", text(&png), "-o", text(&none)], 2, &["--angles", "--sid", "--sod", "--pixel"]);
+}
+
+/// Views as a file states them.
+const VIEWS: &str = "[all]
+sod_mm = 750
+pixel_mm = [2, 2.5]
+fps = 10
+
+[[view]]
+path = \"png\"
+angles_deg = [-30, 20]
+sid_mm = 1000
+r_peaks_s = [0, 0.3, 0.6]
+
+[[view]]
+path = \"jpg\"
+sid_mm = 1100
+angles_deg = [40, -10]
+r_peaks_s = [0, 0.3, 0.6]
+";
+
 /// Writes two runs from different angles; the second has no geometry.
 fn two_runs(directory: &Path) -> [PathBuf; 2] {
     ["whole.dcm", "bare.dcm"].map(|name| {

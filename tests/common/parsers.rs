@@ -35,6 +35,17 @@ pub const PARSERS: &[Parser] = &[
     Parser { name: "npy", file: "v.npy", seeds: npy_volumes, parse: reads_volume },
     Parser { name: "npy_image", file: "i.npy", seeds: npy_images, parse: reads_image },
     Parser { name: "png", file: "i.png", seeds: png_images, parse: reads_image },
+    #[cfg(feature = "dicom")]
+    Parser { name: "jpeg", file: "f.jpg", seeds: || vec![crate::dicom::baseline()], parse: reads_frames },
+    #[cfg(feature = "dicom")]
+    Parser { name: "tiff", file: "f.tif", seeds: tiff_frames, parse: reads_frames },
+    #[cfg(feature = "dicom")]
+    Parser {
+        name: "views_file",
+        file: "views.toml",
+        seeds: || vec![VIEWS.as_bytes().to_vec()],
+        parse: |p| nertca_vk::import::views_file::read(p).is_ok(),
+    },
     Parser { name: "vtp", file: "t.vtp", seeds: vtp_trees, parse: reads_tree },
     Parser { name: "tree_json", file: "t.json", seeds: json_trees, parse: reads_tree },
     Parser { name: "manifest", file: "dataset.json", seeds: || vec![manifest(&NATIVE)], parse: |p| opens(&NATIVE, p) },
@@ -134,6 +145,39 @@ fn png_images() -> Vec<Vec<u8>> {
     vec![png::grey8(10, 6, &codes8).unwrap(), written("i.png", |p| png::write_grey16(p, 10, 6, codes16).unwrap())]
 }
 
+#[cfg(feature = "dicom")]
+fn reads_frames(path: &Path) -> bool {
+    nertca_vk::formats::frames::read(path).is_ok()
+}
+
+/// A file of two pages of 2 x 2 pixels: a header, their values, and a directory for each page.
+#[cfg(feature = "dicom")]
+fn tiff_frames() -> Vec<Vec<u8>> {
+    const PIXELS_AT: [u32; 2] = [8, 12];
+    // Width, height, bits, no compression, white is the largest value, place of the values, rows, bytes.
+    let entries = |at| [(256, 2), (257, 2), (258, 8), (259, 1), (262, 1), (273, at), (278, 2), (279, 4)];
+    let mut file = b"II*\0".to_vec();
+    file.extend(16u32.to_le_bytes());
+    file.extend([10, 200, 30, 40, 50, 60, 70, 80]);
+    for (page, at) in PIXELS_AT.into_iter().enumerate() {
+        let entries = entries(at);
+        file.extend((entries.len() as u16).to_le_bytes());
+        for (tag, value) in entries {
+            let (tag, long, one): (u16, u16, u32) = (tag, 4, 1);
+            file.extend(tag.to_le_bytes().into_iter().chain(long.to_le_bytes()));
+            file.extend(one.to_le_bytes().into_iter().chain(value.to_le_bytes()));
+        }
+        let next = if page == 0 { file.len() as u32 + 4 } else { 0 };
+        file.extend(next.to_le_bytes());
+    }
+    vec![file]
+}
+
+#[cfg(feature = "dicom")]
+const VIEWS: &str = "still = false\n[all]\nsid_mm = 1050\nsod_mm = 750\npixel_mm = 0.3\nfps = 15\n[[view]]\npath = \"lao\"\n\
+    angles_deg = [-30, 20]\nheart_rate_per_min = 72\n[[view]]\npath = \"rao\"\nangles_deg = [40.5, -1e1]\nsid_mm = 1100\n\
+    offset_mm = [3, -1]\nr_peaks_s = [0.05, 0.88, 1.71]\n";
+
 fn reads_tree(path: &Path) -> bool {
     // Its shapes are made as well, since they index its points.
     TreeFile::read(path).is_ok_and(|tree| !tree.at(0.3).branches.is_empty())
@@ -204,5 +248,7 @@ fn checkpoints() -> Vec<Vec<u8>> {
 
 #[cfg(feature = "dicom")]
 fn angiograms() -> Vec<Vec<u8>> {
-    vec![written("a.dcm", |p| crate::dicom::angiogram(p, |_| ()))]
+    let directory = scratch();
+    let plain = written("a.dcm", |p| crate::dicom::angiogram(p, |_| ()));
+    [plain].into_iter().chain(crate::dicom::compressed(directory.path())).collect()
 }

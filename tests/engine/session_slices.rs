@@ -132,3 +132,23 @@ fn long_work_is_cancelled_before_its_next_slice() {
     drop(session);
     expect_silence(gpu);
 }
+
+#[test]
+fn a_closed_session_ends_long_work_and_begins_no_more() {
+    let gpu = gpu();
+    let dataset = small_dataset(16, 16);
+    let session = trained(&gpu, &dataset);
+    let slices = Arc::new(AtomicU32::new(0));
+    let (closing, seen) = (Arc::downgrade(&session), slices.clone());
+    session.on_slices(Some(Arc::new(move || {
+        closing.upgrade().unwrap().close().unwrap();
+        seen.fetch_add(1, Ordering::Relaxed);
+    })));
+    assert!(matches!(session.evaluate(None), Err(Error::Interrupted)));
+    assert_eq!(slices.load(Ordering::Relaxed), 1, "the slice that was under way, and no other");
+    assert!(matches!(session.trees(Some(1e-4), None), Err(Error::Interrupted)), "work that begins later");
+    assert!(session.is_closed());
+    assert_eq!(slices.load(Ordering::Relaxed), 1);
+    drop(session);
+    expect_silence(gpu);
+}

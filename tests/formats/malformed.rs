@@ -181,6 +181,8 @@ fn sizes_that_files_only_claim_reserve_no_memory() {
     const NIFTI_DIM_AT: usize = 40;
     const NIFTI_DATATYPE_AT: usize = 70;
     const COMPLEX_256: i16 = 2048;
+    /// Place of the number of values of the fifth entry of the first page.
+    const TIFF_COUNT_AT: usize = 70;
     let parser = |name: &str| PARSERS.iter().find(|parser| parser.name == name).unwrap();
     let claimed_header = [b"\x93NUMPY\x02\0".as_slice(), &600_000_000u32.to_le_bytes(), b"{}"].concat();
     let mut without_values = (parser("nifti").seeds)().remove(0);
@@ -191,7 +193,9 @@ fn sizes_that_files_only_claim_reserve_no_memory() {
         without_values[at..][..2].copy_from_slice(&value.to_le_bytes());
     }
     let dir = scratch();
-    for (name, bytes) in [("npy", claimed_header), ("nifti", without_values)] {
+    let mut long_list = (parser("tiff").seeds)().remove(0);
+    long_list[TIFF_COUNT_AT..][..4].copy_from_slice(&0x0200_0001u32.to_le_bytes());
+    for (name, bytes) in [("npy", claimed_header), ("nifti", without_values), ("tiff", long_list)] {
         let Parser { file, parse, .. } = parser(name);
         let path = dir.path().join(file);
         std::fs::write(&path, bytes).unwrap();

@@ -486,7 +486,7 @@ fn what_cannot_be_fitted_is_refused() {
     let gpu = gpu();
     let mut dataset = small_dataset(13, 11);
     let refused = |dataset: &Dataset| match Plan::new(&config(&[]), dataset).map(|_| ()) {
-        Err(Error::Config { problem, .. }) => problem,
+        Err(Error::Config { problem, .. } | Error::Unmet { problem, .. }) => problem,
         other => panic!("{other:?}"),
     };
     dataset.frames[2].integrals[15] = f32::NAN;

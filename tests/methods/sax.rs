@@ -396,7 +396,9 @@ fn what_cannot_be_fitted_is_refused() {
     let gpu = gpu();
     let mut dataset = small_dataset(13, 11);
     let refused = |dataset: &Dataset, settings: &[&str]| match Plan::new(&config(settings), dataset).map(|_| ()) {
-        Err(Error::Config { problem, field, .. }) => format!("{field}: {problem}"),
+        Err(Error::Config { problem, field, .. } | Error::Unmet { problem, field, .. }) => {
+            format!("{field}: {problem}")
+        }
         other => panic!("{other:?}"),
     };
     let problem = refused(&dataset, &["sax.window_size=6", "sax.window_num=3"]);

@@ -14,7 +14,7 @@ pub const INTERRUPTED: u8 = 130;
 /// Returns the exit code of an error; 1 for errors without a code of their own.
 pub fn code(error: &Error) -> u8 {
     match error {
-        Error::Config { .. } => USAGE,
+        Error::Config { .. } | Error::Unmet { .. } => USAGE,
         Error::NoDevice(_) => NO_DEVICE,
         Error::DeviceLost { .. } => TRY_AGAIN,
         Error::OutOfMemory { may_pass: true, .. } | Error::Busy(_) => TRY_AGAIN,

@@ -1,22 +1,24 @@
-//! `import pictures`: views as folders of pictures, whose geometry is given by options.
+//! `import pictures`: views as folders of pictures, whose geometry is given by options or by a file.
 
 use super::dicom_args::{RunArgs, for_each};
 use super::output::write_dataset;
 use super::synthetic_args::{AngleList, pitch, view_angles};
 use clap::{Args, ValueEnum};
-use nertca_vk::error::Result;
+use nertca_vk::error::{Error, Result};
 use nertca_vk::geometry::CArm;
+use nertca_vk::import::angiograms::{Gating, ImportOptions};
 use nertca_vk::import::dicom::Relationship;
 use nertca_vk::import::intake::import_pictures;
 use nertca_vk::import::pictures::{PictureView, PixelMeaning};
-use std::path::PathBuf;
+use nertca_vk::import::views_file::{self, ViewsFile};
+use std::path::{Path, PathBuf};
 
 /// Arguments of `import pictures`.
 #[derive(Debug, Args)]
 pub struct ImportPicturesArgs {
     /// Views: a folder with one picture per frame (.png, .jpg or .tif, in the order of the numbers in their names), or a file
     /// with one or more frames.
-    #[arg(required = true, value_name = "DIR_OR_FILE")]
+    #[arg(required_unless_present = "geometry", value_name = "DIR_OR_FILE")]
     pub views: Vec<PathBuf>,
     /// Directory to write.
     #[arg(short, long)]
@@ -24,18 +26,21 @@ pub struct ImportPicturesArgs {
     /// Replace a dataset that the directory already contains.
     #[arg(short, long)]
     pub force: bool,
+    /// TOML file with the views, their geometry and their times, instead of these options (see docs/formats.md).
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["views", "angles", "sid", "sod", "pixel", "fps"])]
+    pub geometry: Option<PathBuf>,
     /// Primary and secondary angle of each view, degrees (LAO and cranial positive).
-    #[arg(long, value_name = "P,S;P,S...", allow_hyphen_values = true, value_parser = view_angles)]
-    pub angles: AngleList,
+    #[arg(long, required_unless_present = "geometry", value_name = "P,S;P,S...", allow_hyphen_values = true, value_parser = view_angles)]
+    pub angles: Option<AngleList>,
     /// Distance from source to detector, mm: one for all views, or one for each.
-    #[arg(long, required = true, value_name = "MM[,MM...]", value_delimiter = ',')]
+    #[arg(long, required_unless_present = "geometry", value_name = "MM[,MM...]", value_delimiter = ',')]
     pub sid: Vec<f64>,
     /// Distance from source to isocentre, mm: one for all views, or one for each.
-    #[arg(long, required = true, value_name = "MM[,MM...]", value_delimiter = ',')]
+    #[arg(long, required_unless_present = "geometry", value_name = "MM[,MM...]", value_delimiter = ',')]
     pub sod: Vec<f64>,
     /// Pitch of the pictures' pixels on the detector along columns and rows, mm: one number or two.
-    #[arg(long, value_name = "MM[,MM]", value_parser = pitch)]
-    pub pixel: [f64; 2],
+    #[arg(long, required_unless_present = "geometry", value_name = "MM[,MM]", value_parser = pitch)]
+    pub pixel: Option<[f64; 2]>,
     /// Frames per second: one for all views, or one for each. Needed unless the object is still or --phase-list is given.
     #[arg(long, value_name = "PER_S[,PER_S...]", value_delimiter = ',')]
     pub fps: Vec<f64>,
@@ -70,25 +75,11 @@ pub enum Meaning {
 
 /// Imports pictures.
 pub fn run(args: &ImportPicturesArgs) -> Result<()> {
-    let n = args.views.len();
-    let (options, gatings) = (args.runs.options()?, args.runs.gatings(n)?);
-    let angles = for_each("--angles", &args.angles.0, n)?;
-    let (sid, sod) = (for_each("--sid", &args.sid, n)?, for_each("--sod", &args.sod, n)?);
-    let fps = for_each("--fps", &args.fps, n)?;
-    let view = |i: usize| PictureView {
-        path: args.views[i].clone(),
-        c_arm: CArm {
-            primary_deg: angles[i].map_or(0.0, |angles| angles.primary_deg),
-            secondary_deg: angles[i].map_or(0.0, |angles| angles.secondary_deg),
-            sid_mm: sid[i].unwrap_or_default(),
-            sod_mm: sod[i].unwrap_or_default(),
-            pixel_mm: args.pixel,
-            offset_mm: [0.0; 2],
-            table_mm: [0.0; 3],
-        },
-        frames_per_s: fps[i],
+    let mut options = args.runs.options()?;
+    let (views, gatings) = match &args.geometry {
+        None => (views(args)?, args.runs.gatings(args.views.len())?),
+        Some(file) => of_file(file, &args.runs, &mut options)?,
     };
-    let views: Vec<PictureView> = (0..n).map(view).collect();
     let meaning = PixelMeaning {
         relationship: match args.intensity {
             Meaning::Display => Relationship::Display,
@@ -103,4 +94,47 @@ pub fn run(args: &ImportPicturesArgs) -> Result<()> {
     notes.iter().for_each(|note| eprintln!("{note}"));
     out!("{}", args.out.display());
     Ok(())
+}
+
+/// Returns the views that the options state.
+fn views(args: &ImportPicturesArgs) -> Result<Vec<PictureView>> {
+    let n = args.views.len();
+    let angles = for_each("--angles", args.angles.as_ref().map_or(&[], |list| &list.0), n)?;
+    let (sid, sod) = (for_each("--sid", &args.sid, n)?, for_each("--sod", &args.sod, n)?);
+    let fps = for_each("--fps", &args.fps, n)?;
+    let view = |i: usize| PictureView {
+        path: args.views[i].clone(),
+        c_arm: CArm {
+            primary_deg: angles[i].map_or(0.0, |angles| angles.primary_deg),
+            secondary_deg: angles[i].map_or(0.0, |angles| angles.secondary_deg),
+            sid_mm: sid[i].unwrap_or_default(),
+            sod_mm: sod[i].unwrap_or_default(),
+            pixel_mm: args.pixel.unwrap_or_default(),
+            offset_mm: [0.0; 2],
+            table_mm: [0.0; 3],
+        },
+        frames_per_s: fps[i],
+    };
+    Ok((0..n).map(view).collect())
+}
+
+/// Returns the views of a file and the sources of their phases; options that state the phases of runs take precedence over the file.
+fn of_file(
+    file: &Path,
+    runs: &RunArgs,
+    options: &mut ImportOptions,
+) -> Result<(Vec<PictureView>, Vec<Option<Gating>>)> {
+    let ViewsFile { views, gatings, still } = views_file::read(file)?;
+    let given = runs.gatings(views.len())?;
+    if still {
+        if given.iter().any(Option::is_some) || runs.gate_by_images {
+            return Err(Error::data(file, "still", "is true, but options state the phases of a beat"));
+        }
+        options.gating = Gating::Still;
+    }
+    if runs.still || runs.gate_by_images {
+        return Ok((views, given));
+    }
+    let gatings = gatings.into_iter().zip(given).map(|(of_file, given)| given.or(of_file)).collect();
+    Ok((views, gatings))
 }

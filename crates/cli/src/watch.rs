@@ -95,6 +95,7 @@ pub fn run(global: &GlobalOptions, args: &WatchArgs) -> Result<()> {
         under_way: None,
         kept: None,
         failed: false,
+        waits: None,
         training: false,
     };
     let ends = || stop.load(Ordering::Relaxed) || serving.is_finished();
@@ -126,6 +127,8 @@ struct Watch<'a> {
     kept: Option<TrainedRun>,
     /// Whether the user was told that training has failed.
     failed: bool,
+    /// Reason why training waits, as the user was told.
+    waits: Option<String>,
     /// Whether training was running at the last check.
     training: bool,
 }
@@ -181,6 +184,12 @@ impl Watch<'_> {
             eprintln!("training failed: {problem}; it starts again with the next run");
             self.failed = true;
         }
+        if let Some(why) = session.waits_for().filter(|_| self.intake.runs() > 1)
+            && self.waits.as_ref() != Some(&why)
+        {
+            eprintln!("training waits for other runs: {why}");
+            self.waits = Some(why);
+        }
         // Planning, and frames that training has not looked at yet, are work, too.
         let trains = session.is_busy();
         if self.training && !trains {
@@ -218,7 +227,7 @@ impl Watch<'_> {
                 Ok(true)
             }
             // Other files may be usable, so the program continues.
-            Err(error @ (Error::Data { .. } | Error::Config { .. } | Error::Io { .. })) => {
+            Err(error @ (Error::Data { .. } | Error::Config { .. } | Error::Unmet { .. } | Error::Io { .. })) => {
                 eprintln!("not imported: {error}");
                 Ok(false)
             }
@@ -259,6 +268,7 @@ impl Watch<'_> {
             }
         }
         self.tree.forget();
+        self.waits = None;
         let session = self.under_way.as_mut().map(|now| {
             now.runs = newest + 1;
             now.session.clone()
@@ -304,7 +314,7 @@ impl Watch<'_> {
             let why = match nothing {
                 Some(Error::NotReady(why)) if self.failed => why,
                 Some(error) if !matches!(error, Error::NotReady(_)) => return Err(error),
-                _ => "runs from at least two angles are needed".into(),
+                _ => self.waits.take().unwrap_or_else(|| "runs from at least two angles are needed".into()),
             };
             return Err(Error::NotReady(format!("nothing was reconstructed: {why}")));
         };

@@ -1,5 +1,6 @@
 //! Reads grey frames from pictures: PNG, JPEG and TIFF, also of several pages.
 
+use crate::decoders;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::image_limits::{MAX_FILE_BYTES, MAX_SIDE};
@@ -10,6 +11,8 @@ use std::path::Path;
 use tiff::ColorType;
 use tiff::decoder::{Decoder, DecodingResult, Limits};
 
+/// Largest factor by which a compression of TIFF makes an image smaller: LZW, for a single value.
+const MAX_COMPRESSION: usize = 4096;
 /// Largest number of pages of a TIFF file.
 const MAX_PAGES: usize = 2000;
 
@@ -47,15 +50,19 @@ pub fn read(path: &Path) -> Result<Vec<GreyFrame>> {
     let bad = |problem: String| Error::data(path, "picture", problem);
     let format = format_of(path).ok_or_else(|| bad("is none of .png .jpg .jpeg .tif .tiff".into()))?;
     let bytes = files::read_limited(path, MAX_FILE_BYTES)?;
-    if format == ImageFormat::Tiff {
-        return pages(&bytes).map_err(bad);
-    }
+    decoders::caught(|| if format == ImageFormat::Tiff { pages(&bytes) } else { picture(&bytes, format) })
+        .and_then(|frames| frames)
+        .map_err(bad)
+}
+
+/// Reads the only frame of a PNG or JPEG file.
+fn picture(bytes: &[u8], format: ImageFormat) -> std::result::Result<Vec<GreyFrame>, String> {
     let mut reader = image::ImageReader::with_format(Cursor::new(bytes), format);
     let mut limits = image::Limits::default();
     (limits.max_image_width, limits.max_image_height) = (Some(MAX_SIDE as u32), Some(MAX_SIDE as u32));
     reader.limits(limits);
-    let decoded = reader.decode().map_err(|e| bad(e.to_string()))?;
-    Ok(vec![grey(decoded).map_err(bad)?])
+    let decoded = reader.decode().map_err(|e| e.to_string())?;
+    Ok(vec![grey(decoded)?])
 }
 
 fn grey(decoded: DynamicImage) -> std::result::Result<GreyFrame, String> {
@@ -101,9 +108,11 @@ fn of_channels(values: &[f32], channels: usize, [width, height]: [usize; 2], whi
 fn pages(bytes: &[u8]) -> std::result::Result<Vec<GreyFrame>, String> {
     let told = |e: tiff::TiffError| e.to_string();
     let mut limits = Limits::default();
-    limits.decoding_buffer_size = 4 * 8 * MAX_SIDE * MAX_SIDE;
+    // Pictures, and lists of places in the file.
+    limits.decoding_buffer_size = (4 * 8 * MAX_SIDE * MAX_SIDE).min(bytes.len() * MAX_COMPRESSION);
     let mut decoder = Decoder::new(Cursor::new(bytes)).map_err(told)?.with_limits(limits);
     let mut frames = Vec::new();
+    let mut claimed = 0;
     loop {
         let (width, height) = decoder.dimensions().map_err(told)?;
         let (width, height) = (width as usize, height as usize);
@@ -121,6 +130,11 @@ fn pages(bytes: &[u8]) -> std::result::Result<Vec<GreyFrame>, String> {
             ColorType::RGBA(_) => 4,
             other => return Err(format!("page {}: {other:?} pixels are not supported", frames.len() + 1)),
         };
+        claimed += width * height * channels * usize::from(colours.bit_depth().div_ceil(8));
+        if claimed > bytes.len() * MAX_COMPRESSION {
+            let page = frames.len() + 1;
+            return Err(format!("page {page}: {width} x {height} pixels are more than {} bytes can hold", bytes.len()));
+        }
         let white = 2f32.powi(i32::from(colours.bit_depth())) - 1.0;
         let values: Vec<f32> = match decoder.read_image().map_err(told)? {
             DecodingResult::U8(values) if colours.bit_depth() == 8 => values.into_iter().map(f32::from).collect(),

@@ -6,10 +6,11 @@
 //! | [`nrrd`], [`nifti`], [`metaimage`], [`npy`], [`raw`], [`vtk`] | volumes and arrays |
 //! | [`mesh`], [`gltf`], [`vtp`], [`swc`] | surfaces and centrelines |
 //! | [`raster`], [`images`], [`png`], [`image_limits`], [`frames`] | pictures |
-//! | [`files`] | atomic writing, locks, limited reading |
+//! | [`files`], [`decoders`] | atomic writing, locks, limited reading; panics of decoders that other projects wrote |
 //!
 //! Lengths are mm, and positions are patient coordinates (LPS) unless a format has others.
 
+pub mod decoders;
 pub mod error;
 pub mod files;
 #[cfg(feature = "frames")]

@@ -1,5 +1,6 @@
 //! `.png` pictures, through the `image` crate.
 
+use crate::decoders;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::image_limits::{MAX_FILE_BYTES, MAX_SIDE};
@@ -19,7 +20,8 @@ pub fn read(path: &Path) -> Result<Image> {
     limits.max_image_width = Some(MAX_SIDE as u32);
     limits.max_image_height = Some(MAX_SIDE as u32);
     reader.limits(limits);
-    let decoded = reader.decode().map_err(|e| Error::data(path, "png", e.to_string()))?;
+    let bad = |problem: String| Error::data(path, "png", problem);
+    let decoded = decoders::caught(|| reader.decode()).map_err(bad)?.map_err(|e| bad(e.to_string()))?;
     let (width, height) = (decoded.width() as usize, decoded.height() as usize);
     let values = match decoded {
         DynamicImage::ImageLuma8(grey) => grey.into_raw().into_iter().map(f32::from).collect(),

@@ -28,7 +28,7 @@ impl GaussianData {
     /// Prepares the data of a fit and appends remarks for the user to `notes`.
     ///
     /// # Errors
-    /// [`crate::error::Error::Config`] where nothing moves, or too little is known to tell.
+    /// [`crate::error::Error::Unmet`] where nothing moves, or too little is known to tell.
     pub fn new(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<GaussianData> {
         let motion = motion::analyse(dataset, &config.hull);
         let (hull, targets) = hull_and_targets(config, dataset, notes)?;

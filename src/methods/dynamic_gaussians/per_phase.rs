@@ -36,7 +36,7 @@ impl GaussianTrainer {
     /// Seeds Gaussians in the hull of the targets.
     ///
     /// # Errors
-    /// [`Error::Config`] for impossible settings or when there is no place for a Gaussian; device errors.
+    /// [`Error::Config`] for impossible settings; [`Error::Unmet`] when there is no place for a Gaussian; device errors.
     pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<GaussianTrainer> {
         let mut rows = seeds::seeds(&targets, &targets.lengths.gaussians(&config.gaussians), config.seed);
         let trainer = Self::with(gpu, targets, config, &Particles::fresh(rows.clone()))?;
@@ -251,7 +251,7 @@ pub(super) fn check_count(particles: &Particles) -> Result<u32> {
     if n == 0 {
         let problem = "no Gaussian is left: there is no motion in the images, or the pruning threshold \
                        gaussians.prune_threshold is too high";
-        return Err(Error::config("gaussians.count", n, problem));
+        return Err(Error::unmet("gaussians.count", n, problem));
     }
     u32::try_from(n).map_err(|_| Error::config("gaussians.count", n, "is too many Gaussians"))
 }

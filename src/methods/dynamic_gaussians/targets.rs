@@ -98,24 +98,24 @@ impl Targets {
     /// Brings a dataset and its motion into the Gaussians' units.
     ///
     /// # Errors
-    /// [`Error::Config`] when nothing moves, too little is known to tell, or a pixel is not a number.
+    /// [`Error::Unmet`] when nothing moves, or too little is known to tell; [`Error::Config`] when a pixel is not a number.
     pub fn new(dataset: &Dataset, motion: &SoftMotion, settings: &sections::Gaussians) -> Result<Targets> {
         if motion.views.is_empty() {
             let problem = "no training view has two phases, e.g. because the C-arm or the table moves from image to \
                            image, so the static background behind the vessels is not known. Try the preset paper, \
                            which trains on whole images, or the preset fast-mlp with loss.dynamic_target = absolute, \
                            which also suits static objects";
-            return Err(Error::config("dataset", dataset.path.display(), problem));
+            return Err(Error::unmet("dataset", dataset.path.display(), problem));
         }
         if motion.views.len() == 1 {
             let problem = "only one training view has two phases; two such views are needed to locate a vessel along a \
                            ray";
-            return Err(Error::config("dataset", dataset.path.display(), problem));
+            return Err(Error::unmet("dataset", dataset.path.display(), problem));
         }
         Series::of(dataset).iter().try_for_each(|s| check_finite(dataset, s))?;
         let strongest = median(motion.views.iter().map(|v| f64::from(v.background.strongest)).collect());
         if strongest.is_nan() || strongest <= 0.0 || motion.hull.share() == 0.0 {
-            return Err(Error::config("dataset", dataset.path.display(), no_common_motion(motion)));
+            return Err(Error::unmet("dataset", dataset.path.display(), no_common_motion(motion)));
         }
         let pixel = |v: usize| {
             let rays = &dataset.views[v].rays;

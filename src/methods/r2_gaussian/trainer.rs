@@ -201,7 +201,7 @@ fn check_count(state: &R2State, data: &R2Data) -> Result<u32> {
             "no Gaussian of {} is left: the pruning threshold r2.density_min_threshold is too high, or the images are empty",
             data.sets.name(empty)
         );
-        return Err(Error::config("r2.n_points", 0, problem));
+        return Err(Error::unmet("r2.n_points", 0, problem));
     }
     u32::try_from(state.rows.len()).map_err(|_| Error::config("r2.n_points", state.rows.len(), "is too many Gaussians"))
 }

@@ -42,8 +42,8 @@ impl SaxData {
     /// Converts a dataset for a volume of half side `half`, world units.
     ///
     /// # Errors
-    /// [`Error::Config`] for images of several sizes or without room for the windows, for a pixel that is not finite, and for
-    /// phases that no image shows.
+    /// [`Error::Config`] for images of several sizes, and for a pixel that is not finite; [`Error::Unmet`] for images without room for the
+    /// windows, and for phases that no image shows.
     pub fn new(dataset: &Dataset, settings: &Sax, half: f64) -> Result<SaxData> {
         check_sizes(dataset, "SAX-NeRF")?;
         check_windows(settings, [dataset.width, dataset.height])?;
@@ -118,7 +118,7 @@ fn check_windows(settings: &Sax, [width, height]: [usize; 2]) -> Result<()> {
         let problem = format!(
             "an image of {width} x {height} pixels has room for at most {room} windows of {side} x {side} pixels"
         );
-        return Err(Error::config("sax.window_num", settings.windows, problem));
+        return Err(Error::unmet("sax.window_num", settings.windows, problem));
     }
     Ok(())
 }

@@ -69,7 +69,7 @@ impl XData {
     /// Brings a dataset into a volume of half a side `half` each way, world units.
     ///
     /// # Errors
-    /// [`Error::Config`] for images of several sizes, for a pixel that is not a number, and where all sources are at one
+    /// [`Error::Config`] for images of several sizes, and for a pixel that is not a number; [`Error::Unmet`] where all sources are at one
     /// place and no extent is stated.
     pub fn new(dataset: &Dataset, settings: &X, half: f64) -> Result<XData> {
         check_sizes(dataset, "X-Gaussian")?;
@@ -91,7 +91,7 @@ impl XData {
         if extent_mm <= 0.0 {
             let problem = "the extent of the scene cannot be computed, because all views have the same source \
                            position: set it, in mm";
-            return Err(Error::config("x.extent_mm", settings.extent_mm, problem));
+            return Err(Error::unmet("x.extent_mm", settings.extent_mm, problem));
         }
         Ok(XData {
             half_mm: half * MM_PER_UNIT,

@@ -187,6 +187,7 @@ def test_options_that_cannot_be(context: Context) -> None:
         {"phases": 0},
         {"phases": -1},
         {"phases": 2.5},
+        {"phases": 3, "still": True},
         {"phases": 3, "preset": "slow"},
         {"phases": 3, "depth_half_extent_mm": NAN},
         {"phases": 3, "vessel_attenuation_per_mm": -1.0},
