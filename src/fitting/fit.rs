@@ -203,6 +203,14 @@ pub trait FitData: Send {
     /// [`Error::Config`] for impossible settings, for a saved fit of other sizes and where memory does not suffice; device errors.
     fn begin(&self, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<Box<dyn Fit>>;
 
+    /// Begins the only fit to these data, as [`FitData::begin`] does, and takes over their memory where the method can.
+    ///
+    /// # Errors
+    /// Errors of [`FitData::begin`].
+    fn begin_only(self: Box<Self>, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<Box<dyn Fit>> {
+        self.begin(start, notes)
+    }
+
     /// Begins a fit from scratch for measurements of its Gaussians.
     ///
     /// # Errors

@@ -96,7 +96,11 @@ impl Method for DynamicGaussiansMethod {
 
 impl FitData for GaussianData {
     fn begin(&self, start: &FitStart<'_>, _: &mut Vec<String>) -> Result<Box<dyn Fit>> {
-        Ok(Box::new(GaussiansFit::new(self, start)?))
+        Ok(Box::new(GaussiansFit::new(self.clone(), start)?))
+    }
+
+    fn begin_only(self: Box<Self>, start: &FitStart<'_>, _: &mut Vec<String>) -> Result<Box<dyn Fit>> {
+        Ok(Box::new(GaussiansFit::new(*self, start)?))
     }
 
     fn begin_timed(&self, start: &FitStart<'_>) -> Result<Box<dyn TimedFit>> {

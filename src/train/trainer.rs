@@ -137,7 +137,7 @@ impl Trainer {
         let mut config = plan.config.clone();
         config.train.iterations_per_submit = tuning.iterations_per_submit.unwrap_or(config.train.iterations_per_submit);
         let data = plan.data.take().ok_or_else(|| Error::Internal("a fit has begun with these data".into()))?;
-        let fit = data.begin(&FitStart { gpu, config: &config, tuning: &tuning, from }, &mut plan.notes)?;
+        let fit = data.begin_only(&FitStart { gpu, config: &config, tuning: &tuning, from }, &mut plan.notes)?;
         Ok(Trainer {
             watch: LossWatch::new(&plan.config, methods::of(&plan.config).smaller_steps()),
             large_loss: None,

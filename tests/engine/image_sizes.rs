@@ -208,3 +208,27 @@ fn a_reconstruction_of_cropped_views_is_as_good_and_scored_on_what_they_show() {
     drop(renderer);
     expect_silence(gpu);
 }
+
+/// Side of images that are fitted from coarse to fine, and that two does not divide.
+const LARGE: usize = 261;
+
+#[test]
+#[ignore = "long: tools/test --all"]
+fn large_images_are_fitted_from_coarse_to_fine() {
+    let (gpu, directory) = (gpu(), tempfile::tempdir().unwrap());
+    let dataset = phantom(&gpu, &directory.path().join("large"), LARGE, 4);
+    let config = Config::preset(Preset::Fast);
+    let plan = Plan::new(&config, &dataset).unwrap();
+    let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
+    let pixel_of = |trainer: &Trainer| trainer.outline().gaussians.unwrap().rows().units.pixel;
+    run(&mut trainer, 70);
+    let coarse = pixel_of(&trainer);
+    run(&mut trainer, config.gaussian_iterations());
+    let fine = pixel_of(&trainer);
+    assert!((coarse / fine - 2.0).abs() < 1e-6, "{coarse} and {fine}");
+    let frames: Vec<_> = dataset.validation().iter().filter(|frame| frame.phase % 5 == 0).collect();
+    let renderer = Renderer::new(&gpu, &trainer.model().unwrap(), tuning(&gpu)).unwrap();
+    let dice = evaluate(&renderer, &dataset, &frames, 0, None, |_| Ok(())).unwrap().dice.dynamic.unwrap();
+    println!("Dice {dice:.4}");
+    assert!(dice > 0.92, "{dice}");
+}

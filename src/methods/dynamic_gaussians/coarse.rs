@@ -79,3 +79,78 @@ impl Targets {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gaussians::view::SplatView;
+    use crate::geometry::{CArm, Geometry};
+    use glam::DVec3;
+
+    const WIDTH: usize = 7;
+    const HEIGHT: usize = 4;
+
+    fn targets() -> Targets {
+        let geometry = CArm {
+            primary_deg: 20.0,
+            secondary_deg: -10.0,
+            sid_mm: 1000.0,
+            sod_mm: 700.0,
+            pixel_mm: [1.0, 1.2],
+            offset_mm: [0.0; 2],
+            table_mm: [0.0; 3],
+        };
+        let units = Units { pixel: 0.01, strongest: 0.2 };
+        let rays = Geometry::CArm(geometry).rays(WIDTH, HEIGHT).unwrap();
+        let images: Vec<f32> = (0..2 * WIDTH * HEIGHT).map(|p| p as f32).collect();
+        let mut weight = vec![0.5; images.len()];
+        weight[WIDTH + 2] = 0.0;
+        Targets {
+            units,
+            width: WIDTH,
+            height: HEIGHT,
+            n_phases: 2,
+            n_views: 1,
+            views: vec![SplatView { after_phase: 0.25, ..SplatView::new(&rays, units) }; 2],
+            image_of: vec![Some(0), Some(1)],
+            n_images: 2,
+            max: images.iter().map(|v| v + 3.0).collect(),
+            low: images.iter().map(|v| v - 1.0).collect(),
+            high: images.iter().map(|v| v + 2.0).collect(),
+            noise: vec![0.1; images.len()],
+            images,
+            weight,
+            lengths: Lengths { factor: 4.0, smoothing: 1.2 },
+            rest_phase: 1,
+            places: vec![vec![PossibleVessel { position: DVec3::new(4.0, 6.0, -8.0), evidence: 9.0 }], Vec::new()],
+            cell: 3.0,
+        }
+    }
+
+    #[test]
+    fn coarse_pixels_are_means_and_lengths_shrink() {
+        let (fine, coarse) = (targets(), targets().coarser(2, 0.05));
+        assert_eq!((coarse.width, coarse.height, coarse.n_images), (3, 2, 2), "the last column is left out");
+        // Pixels 0, 1, 7 and 8 have the mean 4; pixels of the second image are 28 higher, of the second row 14.
+        assert_eq!(coarse.images, [4.0, 6.0, 8.0, 18.0, 20.0, 22.0, 32.0, 34.0, 36.0, 46.0, 48.0, 50.0]);
+        assert_eq!((coarse.low[1], coarse.high[1], coarse.max[1]), (5.0, 8.0, 9.0));
+        assert!(coarse.noise.iter().all(|s| (s - 0.05).abs() < 1e-7), "half the noise");
+        let hidden: Vec<usize> = (0..12).filter(|p| coarse.weight[*p] == 0.0).collect();
+        assert_eq!(hidden, [1], "one of its pixels is hidden");
+        assert!((coarse.weight[0] - 0.5f32.sqrt()).abs() < 1e-6, "the weight of its own noise");
+        assert_eq!((coarse.units.pixel, coarse.units.strongest, coarse.cell), (0.02, 0.2, 1.5));
+        assert_eq!(coarse.lengths, Lengths { factor: 2.0, smoothing: 1.2 });
+        assert_eq!((coarse.rest_phase, coarse.image_of.clone()), (1, fine.image_of.clone()));
+        let at = coarse.places[0][0].position;
+        assert_eq!(at, DVec3::new(2.0, 3.0, -4.0));
+        let [(_, u, v), (_, wide_u, wide_v)] = [fine.views[0].project(2.0 * at), coarse.views[0].project(at)];
+        assert!((2.0 * wide_u + 0.5 - u).abs() < 1e-9 && (2.0 * wide_v + 0.5 - v).abs() < 1e-9);
+        assert_eq!(coarse.views[0].after_phase, 0.25);
+    }
+
+    #[test]
+    fn only_large_images_are_begun_on_coarser_ones() {
+        let of = |width, height| Targets { width, height, ..targets() }.coarse_factor();
+        assert_eq!([of(100, 100), of(255, 400), of(256, 256), of(512, 512), of(1024, 700)], [1, 1, 2, 4, 5]);
+    }
+}

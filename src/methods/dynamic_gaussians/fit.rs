@@ -71,6 +71,11 @@ impl GaussianFit {
         }
     }
 
+    /// Tells whether the fit uses coarser images so far.
+    pub(crate) fn is_coarse(&self) -> bool {
+        matches!(self, GaussianFit::Start(_, Some(_)) | GaussianFit::Deformable(_, Some(_)))
+    }
+
     /// Iterations done.
     pub(crate) fn step(&self) -> u32 {
         match self {

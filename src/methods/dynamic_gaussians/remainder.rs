@@ -25,9 +25,8 @@ pub struct Bounds {
 
 /// Computes bounds from the background that the field's `images` (`[image][pixel]`, shares of the strongest change) leave: the
 /// median over a view's phases, and what changes slowly from pixel to pixel around it. Views of fewer than three phases keep
-/// their bounds.
-pub fn bounds(targets: &Targets, images: &[f32]) -> Bounds {
-    let mut bounds = Bounds { low: targets.low.clone(), high: targets.high.clone() };
+/// their `bounds`.
+pub fn bounds(targets: &Targets, images: &[f32], mut bounds: Bounds) -> Bounds {
     let n = targets.n_pixels();
     for view in 0..targets.n_views {
         let of_view: Vec<usize> =
@@ -141,6 +140,10 @@ mod tests {
         }
     }
 
+    fn before_it(targets: &Targets) -> Bounds {
+        Bounds { low: targets.low.clone(), high: targets.high.clone() }
+    }
+
     fn error(bound: &[f32], vessel: &[f32]) -> f32 {
         bound.iter().zip(vessel).map(|(b, v)| (b - v).abs()).sum::<f32>() / vessel.len() as f32
     }
@@ -152,7 +155,7 @@ mod tests {
         let targets = targets(&images);
         // A field that has found most of the vessel.
         let found: Vec<f32> = vessel.iter().map(|v| 0.8 * v).collect();
-        let bounds = bounds(&targets, &found);
+        let bounds = bounds(&targets, &found, before_it(&targets));
         let (before, low, high) =
             (error(&targets.low, &vessel), error(&bounds.low, &vessel), error(&bounds.high, &vessel));
         println!("{before:.4} to {low:.4}, {high:.4}");
@@ -165,7 +168,7 @@ mod tests {
         let (vessel, _) = scene();
         let mut targets = targets(&vessel);
         targets.image_of.iter_mut().skip(2).for_each(|image| *image = None);
-        let bounds = bounds(&targets, &vec![0.3; vessel.len()]);
+        let bounds = bounds(&targets, &vec![0.3; vessel.len()], before_it(&targets));
         assert_eq!((bounds.low, bounds.high), (targets.low, targets.high));
     }
 }

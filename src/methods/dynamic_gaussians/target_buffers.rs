@@ -49,11 +49,12 @@ pub(super) fn renew_bounds(
     setup: &GaussianSetup,
     images: &[f32],
 ) -> Result<()> {
-    let Bounds { low, high } = remainder::bounds(targets, images);
-    gpu.upload(&buffers.bound_low, 0, &padded(&low, targets, setup))?;
-    gpu.upload(&buffers.bound_high, 0, &padded(&high, targets, setup))?;
+    // Bounds of large images take hundreds of megabytes: they are replaced in place.
+    let before = Bounds { low: std::mem::take(&mut targets.low), high: std::mem::take(&mut targets.high) };
+    let Bounds { low, high } = remainder::bounds(targets, images, before);
     (targets.low, targets.high) = (low, high);
-    Ok(())
+    gpu.upload(&buffers.bound_low, 0, &padded(&targets.low, targets, setup))?;
+    Ok(gpu.upload(&buffers.bound_high, 0, &padded(&targets.high, targets, setup))?)
 }
 
 /// Images, each padded with zeros up to the stride.

@@ -28,8 +28,8 @@ pub struct GaussiansFit {
     /// View of each training image, and its time, counted in phases.
     shots: Vec<(ViewRays, f64)>,
     fields: FieldsFit,
-    /// Whether the static field has begun since the losses were last asked for a new objective.
-    has_begun: bool,
+    /// Whether, since the last call of [`Fit::new_objective`], the static field or the fit to all pixels has begun.
+    has_new_objective: bool,
 }
 
 impl GaussiansFit {
@@ -40,7 +40,8 @@ impl GaussiansFit {
     ///
     /// # Errors
     /// Errors of [`GaussianFit::new`] and [`FieldsFit::new`].
-    pub(crate) fn new(data: &GaussianData, start: &FitStart<'_>) -> Result<GaussiansFit> {
+    pub(crate) fn new(data: GaussianData, start: &FitStart<'_>) -> Result<GaussiansFit> {
+        let GaussianData { targets, fields, shots } = data;
         let (gpu, config) = (start.gpu, start.config);
         let resumed = start.from.resumed();
         let earlier = match start.from {
@@ -55,8 +56,8 @@ impl GaussiansFit {
             Some(field) => (None, field.clone()),
             None => {
                 let mut fit = match earlier {
-                    Some(earlier) => GaussianFit::after(gpu, data.targets.clone(), config, earlier)?,
-                    None => GaussianFit::new(gpu, data.targets.clone(), config)?,
+                    Some(earlier) => GaussianFit::after(gpu, targets, config, earlier)?,
+                    None => GaussianFit::new(gpu, targets, config)?,
                 };
                 while fit.step() < done {
                     fit.advance(done)?;
@@ -72,15 +73,15 @@ impl GaussiansFit {
             Some(fit) => fit.step(),
             None => saved_fields.map_or(0, |saved| saved.step()),
         };
-        let fields = FieldsFit::new(gpu, data.fields.clone(), start.tuning.clone(), saved_fields, done)?;
+        let fields = FieldsFit::new(gpu, fields, start.tuning.clone(), saved_fields, done)?;
         let fit = GaussiansFit {
             gpu: gpu.clone(),
             gaussians,
             feed: Arc::new(Mutex::new((0, shown.cloned().unwrap_or(field)))),
             shows_earlier,
-            shots: data.shots.clone(),
+            shots,
             fields,
-            has_begun: false,
+            has_new_objective: false,
         };
         // A field that was fitted before has left its images already.
         if fit.gaussians.is_none() {
@@ -102,7 +103,9 @@ impl GaussiansFit {
     /// Runs some iterations of the Gaussians towards `until`, and ends their fit after `end` iterations; returns their losses.
     fn advance_gaussians(&mut self, until: u32, end: u32) -> Result<Vec<f64>> {
         let Some(fit) = &mut self.gaussians else { return Ok(Vec::new()) };
+        let was_coarse = fit.is_coarse();
         let losses = fit.advance(until.min(end))?;
+        self.has_new_objective |= was_coarse && !fit.is_coarse();
         self.shows_earlier &= !fit.is_presentable(end);
         if self.shows_earlier {
             return Ok(losses);
@@ -155,7 +158,7 @@ impl Fit for GaussiansFit {
         let losses = self.advance_gaussians(until, end)?;
         if self.gaussians.is_none() {
             self.fields.set_images(&self.remaining_images()?)?;
-            self.has_begun = true;
+            self.has_new_objective = true;
         }
         let first = self.fields.step() + 1;
         self.fields.count(losses.len() as u32);
@@ -163,7 +166,7 @@ impl Fit for GaussiansFit {
     }
 
     fn new_objective(&mut self) -> Option<&'static str> {
-        std::mem::take(&mut self.has_begun).then_some(SMALLER_STEPS)
+        std::mem::take(&mut self.has_new_objective).then_some(SMALLER_STEPS)
     }
 
     fn outline(&self) -> FitField {
