@@ -216,6 +216,7 @@ mod tests {
             mask: None,
             after_phase: 0.0,
             heart_shift_mm: [0.0; 3],
+            contrast: 1.0,
         };
         Dataset {
             path: "test".into(),

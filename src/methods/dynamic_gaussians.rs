@@ -9,6 +9,7 @@ pub(crate) mod fine;
 pub mod fit;
 pub mod lengths;
 pub mod per_phase;
+mod pruning;
 pub mod remainder;
 pub mod seeds;
 #[cfg(feature = "diagnostics")]
@@ -17,6 +18,7 @@ pub mod setup;
 pub mod soft_hull;
 pub mod stages;
 pub mod start;
+mod stiffness;
 pub(crate) mod target_buffers;
 pub mod targets;
 pub mod trainer;

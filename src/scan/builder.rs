@@ -122,6 +122,7 @@ impl Builder {
             integrals: new.image.values.iter().map(|v| (new.to_integral)(*v)).collect(),
             mask: new.mask,
             heart_shift_mm: new.heart_shift_mm,
+            contrast: 1.0,
         });
         Ok(())
     }

@@ -154,6 +154,8 @@ pub struct Frame {
     pub mask: Option<Vec<bool>>,
     /// Displacement of the heart from its mean position by breathing, along (posterior, left, superior), mm.
     pub heart_shift_mm: [f64; 3],
+    /// Contrast of the vessels in this frame, as a multiple of the mean over the frames.
+    pub contrast: f64,
 }
 
 impl Frame {
@@ -253,6 +255,13 @@ impl Dataset {
         let frames = self.training().iter().filter(|f| (f.view, f.phase) == (view, phase));
         let (sum, n) = frames.fold((0.0, 0u32), |(sum, n), f| (sum + f.after_phase, n + 1));
         sum / f64::from(n.max(1))
+    }
+
+    /// Mean contrast of a view's training frames at a phase; 1 if the view has none.
+    pub fn contrast_at(&self, view: usize, phase: u32) -> f64 {
+        let frames = self.training().iter().filter(|f| (f.view, f.phase) == (view, phase));
+        let (sum, n) = frames.fold((0.0, 0u32), |(sum, n), f| (sum + f.contrast, n + 1));
+        if n == 0 { 1.0 } else { sum / f64::from(n) }
     }
 
     /// Tells whether some training frame has a displacement of the heart.

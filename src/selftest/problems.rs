@@ -64,6 +64,7 @@ pub fn small_dataset(width: usize, height: usize, n_phases: u32) -> Result<Datas
                 mask: None,
                 after_phase: 0.0,
                 heart_shift_mm: [0.0; 3],
+                contrast: 1.0,
             });
         }
     }
@@ -182,6 +183,7 @@ pub fn targets(width: usize, height: usize, n_phases: usize) -> Result<Targets> 
         high: all.clone().map(|i| wave(i, 0.37) - 0.1 + 0.3 * wave(i, 0.71)).collect(),
         weight: all.map(|i| 0.5 + 0.5 * wave(i, 0.13)).collect(),
         noise: Vec::new(),
+        contrast: vec![1.0; n_images],
         lengths: Lengths { factor: 1.0, smoothing: 1.0 },
         rest_phase: 0,
         images: Vec::new(),

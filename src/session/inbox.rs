@@ -151,6 +151,7 @@ impl Inbox {
             mask: new.mask,
             after_phase: 0.0,
             heart_shift_mm: [0.0; 3],
+            contrast: 1.0,
         };
         self.frames.push(Some(Kept { frame, moment: new.moment, change: 0 }));
         Ok(())

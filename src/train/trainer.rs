@@ -57,6 +57,9 @@ pub fn data_fingerprint(dataset: &Dataset) -> String {
         }
         let rest = frame.heart_shift_mm.iter().chain([&frame.after_phase]);
         rest.filter(|s| **s != 0.0).for_each(|s| eat((*s as f32).to_bits()));
+        if frame.contrast != 1.0 {
+            eat((frame.contrast as f32).to_bits());
+        }
         dataset.own(frame.view, &frame.integrals).iter().for_each(|v| eat(v.to_bits()));
     }
     if dataset.sizes().len() > 1 {
@@ -330,6 +333,7 @@ mod tests {
             mask: None,
             after_phase: 0.0,
             heart_shift_mm: [0.0; 3],
+            contrast: 1.0,
         };
         Dataset {
             path: "test".into(),

@@ -129,6 +129,7 @@ impl Studio {
                     mask,
                     after_phase: 0.0,
                     heart_shift_mm: [0.0; 3],
+                    contrast: 1.0,
                 });
                 breath.push(world_from_lps_mm(lps));
             }

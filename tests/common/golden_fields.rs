@@ -50,6 +50,7 @@ impl Golden {
                     mask: None,
                     after_phase: after[frames.len() % after.len()],
                     heart_shift_mm: [0.0; 3],
+                    contrast: 1.0,
                 });
             }
         }

@@ -27,6 +27,7 @@ pub fn dataset(angles: &[[f64; 2]], [width, height]: [usize; 2], image: impl Fn(
         mask: None,
         after_phase: 0.0,
         heart_shift_mm: [0.0; 3],
+        contrast: 1.0,
     };
     Dataset {
         path: "test".into(),

@@ -79,6 +79,7 @@ fn angiograms_of(angles: &[(f64, f64)], flaws: Flaws, vessels: &[Vec<(DVec3, f64
                 mask: None,
                 after_phase: 0.0,
                 heart_shift_mm: [0.0; 3],
+                contrast: 1.0,
             });
         }
     }

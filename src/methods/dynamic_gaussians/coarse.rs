@@ -66,6 +66,7 @@ impl Targets {
             height,
             views: self.views.iter().map(|view| view.coarser(scale)).collect(),
             image_of: self.image_of.clone(),
+            contrast: self.contrast.clone(),
             images: mean(&self.images),
             max: mean(&self.max),
             low: mean(&self.low),
@@ -118,6 +119,7 @@ mod tests {
             low: images.iter().map(|v| v - 1.0).collect(),
             high: images.iter().map(|v| v + 2.0).collect(),
             noise: vec![0.1; images.len()],
+            contrast: vec![1.0, 0.9],
             images,
             weight,
             lengths: Lengths { factor: 4.0, smoothing: 1.2 },
@@ -140,7 +142,7 @@ mod tests {
         assert!((coarse.weight[0] - 0.5f32.sqrt()).abs() < 1e-6, "the weight of its own noise");
         assert_eq!((coarse.units.pixel, coarse.units.strongest, coarse.cell), (0.02, 0.2, 1.5));
         assert_eq!(coarse.lengths, Lengths { factor: 2.0, smoothing: 1.2 });
-        assert_eq!((coarse.rest_phase, coarse.image_of.clone()), (1, fine.image_of.clone()));
+        assert_eq!((coarse.rest_phase, &coarse.image_of, &coarse.contrast), (1, &fine.image_of, &fine.contrast));
         let at = coarse.places[0][0].position;
         assert_eq!(at, DVec3::new(2.0, 3.0, -4.0));
         let [(_, u, v), (_, wide_u, wide_v)] = [fine.views[0].project(2.0 * at), coarse.views[0].project(at)];

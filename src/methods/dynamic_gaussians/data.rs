@@ -13,6 +13,17 @@ use crate::model::hull::Hull;
 use crate::model::scene::Scene;
 use crate::scan::dataset::{Dataset, Frame};
 
+/// Circumstances of an image.
+#[derive(Clone)]
+pub struct Shot {
+    /// Rays that see the heart.
+    pub rays: ViewRays,
+    /// Time in the beat, counted in phases.
+    pub phases: f64,
+    /// Contrast of the vessels, as a multiple of the mean over the frames.
+    pub contrast: f32,
+}
+
 /// Data of a fit.
 #[derive(Clone)]
 pub struct GaussianData {
@@ -20,8 +31,8 @@ pub struct GaussianData {
     pub targets: Targets,
     /// Data of the static field.
     pub fields: FieldData,
-    /// View of each training image, and its time, counted in phases.
-    pub shots: Vec<(ViewRays, f64)>,
+    /// Circumstances of each training image.
+    pub shots: Vec<Shot>,
 }
 
 impl GaussianData {
@@ -35,13 +46,17 @@ impl GaussianData {
         let scene = Scene::new(config, dataset, &motion, Some(&hull))?;
         let lists = RayLists::of_hull(config, dataset, &motion, Some(&hull));
         let fields = FieldData::new(config, dataset, &motion, Some(hull), scene, lists)?;
-        let shot = |frame: &Frame| (dataset.heart_rays(frame), frame.beat_time().phases(dataset.n_phases));
+        let shot = |frame: &Frame| Shot {
+            rays: dataset.heart_rays(frame),
+            phases: frame.beat_time().phases(dataset.n_phases),
+            contrast: frame.contrast as f32,
+        };
         Ok(GaussianData { targets, fields, shots: dataset.training().iter().map(shot).collect() })
     }
 }
 
 /// Cells along each axis of the soft hull that Gaussians are seeded in.
-const SOFT_HULL_CELLS: usize = 112;
+pub(super) const SOFT_HULL_CELLS: usize = 112;
 
 /// Computes where vessels may be, and the targets that Gaussians are fitted to.
 fn hull_and_targets(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<(Hull, Targets)> {

@@ -15,6 +15,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup, GaussianView};
 use crate::methods::dynamic_gaussians::per_phase::{MAX_PASSES, check_count, strong};
+use crate::methods::dynamic_gaussians::pruning::{Judge, short_components};
 use crate::methods::dynamic_gaussians::stages::{
     DeformableKernels, DeformablePass, GridBuffers, OwnMotion, OwnMotionBuffers, Track,
 };
@@ -53,7 +54,7 @@ impl Fit {
     fn joint(gpu: &Gpu, targets: &Targets, config: &Config) -> Result<Fit> {
         let settings = targets.lengths.gaussians(&config.gaussians);
         let setup = setup::gaussian_setup(targets, &settings);
-        let deformable = setup::deformable_setup(targets, &targets.lengths.deformable(&config.deformable));
+        let deformable = setup::deformable_setup(targets, &targets.deformable(&config.deformable));
         let buffers = target_buffers(gpu, targets, &setup, &setup::schedule(&settings))?;
         Ok(Fit { setup, deformable, targets: buffers, grid: GridBuffers::new(gpu, &deformable, targets.n_phases)? })
     }
@@ -100,12 +101,23 @@ impl DeformableTrainer {
         let (particles, own) = upload(gpu, &joint.setup, particles, &own)?;
         let iterations = record(gpu, &kernels, &joint, (&particles, &own), n, config.train.iterations_per_submit)?;
         let (gpu, config) = (gpu.clone(), config.clone());
-        Ok(DeformableTrainer { gpu, targets, config, kernels, joint, particles, own, n, iterations, step: 0 })
+        Ok(DeformableTrainer {
+            gpu,
+            targets,
+            config,
+            kernels,
+            joint,
+            particles,
+            own,
+            n,
+            iterations,
+            step: 0,
+        })
     }
 
     /// Returns the fit by which the grid is tracked.
     pub(super) fn tracking(&self) -> Result<Fit> {
-        self.joint.tracking(&self.gpu, &self.targets, &self.targets.lengths.deformable(&self.config.deformable))
+        self.joint.tracking(&self.gpu, &self.targets, &self.targets.deformable(&self.config.deformable))
     }
 
     /// Tracks the grid to a phase from those before it, on blurred images, in submits as long as those of the fit.
@@ -221,6 +233,7 @@ impl DeformableTrainer {
         self.step += self.iterations.run(&self.gpu, first, stop)?;
         if setup::parts_from_strays(&self.config.gaussians, self.step) {
             self.drop_strays()?;
+            self.drop_unsupported()?;
         }
         losses(&self.gpu, &self.joint.targets.gaussian_ring, first..self.step, SMALLER_STEPS)
     }
@@ -256,8 +269,37 @@ impl DeformableTrainer {
         self.retain(|rows| vessels(rows, &setup, link)).map(|_| ())
     }
 
+    /// Drops short components that the images do not support.
+    fn drop_unsupported(&mut self) -> Result<()> {
+        let n = self.n as usize;
+        let particles = self.particles.download(&self.gpu, n)?;
+        let components = short_components(&particles.rows, &self.joint.setup, self.targets.lengths.factor);
+        if components.is_empty() {
+            return Ok(());
+        }
+        let own = self.own.download(&self.gpu, n * self.joint.deformable.n_basis as usize)?;
+        let judge = Judge::new(&self.targets, &self.images()?);
+        let mut keep = vec![true; n];
+        for component in components {
+            let mut member = vec![false; n];
+            component.iter().for_each(|i| member[*i] = true);
+            let (mut particles, mut own) = (particles.clone(), own.clone());
+            particles.retain(&member);
+            own.retain(&member);
+            let (particles, own) = upload(&self.gpu, &self.joint.setup, &particles, &own)?;
+            if !judge.supports(&self.images_of((&particles, &own), component.len() as u32)?) {
+                component.iter().for_each(|i| keep[*i] = false);
+            }
+        }
+        // A set without Gaussians is no set: where the images support none, all stay.
+        if keep.contains(&true) && keep.contains(&false) {
+            self.retain(|_| keep)?;
+        }
+        Ok(())
+    }
+
     /// Keeps some of the Gaussians on the device, and returns them.
-    fn retain(&mut self, kept: impl Fn(&[Gaussian]) -> Vec<bool>) -> Result<(Particles, OwnMotion)> {
+    fn retain(&mut self, kept: impl FnOnce(&[Gaussian]) -> Vec<bool>) -> Result<(Particles, OwnMotion)> {
         let n = self.n as usize;
         let mut particles = self.particles.download(&self.gpu, n)?;
         let mut own = self.own.download(&self.gpu, n * self.joint.deformable.n_basis as usize)?;
@@ -281,8 +323,13 @@ impl DeformableTrainer {
     /// # Errors
     /// Device errors.
     pub fn images(&self) -> Result<Vec<f32>> {
+        self.images_of((&self.particles, &self.own), self.n)
+    }
+
+    /// Images of `n` Gaussians that move on the present grid.
+    fn images_of(&self, bound: Bound<'_>, n: u32) -> Result<Vec<f32>> {
         let mut recording = Recording::new(&self.gpu, "images of a deformable")?;
-        let mut pass = pass(&mut recording, &self.kernels, &self.joint, (&self.particles, &self.own), self.n);
+        let mut pass = pass(&mut recording, &self.kernels, &self.joint, bound, n);
         record_images(&mut pass, 0..self.joint.setup.n_phases)?;
         self.gpu.wait(recording.finish()?.submit()?)?;
         take_images(&self.gpu, &self.joint.targets, &self.targets, &self.joint.setup)

@@ -23,36 +23,75 @@ pub struct Bounds {
     pub high: Vec<f32>,
 }
 
-/// Computes bounds from the background that the field's `images` (`[image][pixel]`, shares of the strongest change) leave: the
-/// median over a view's phases, and what changes slowly from pixel to pixel around it. Views of fewer than three phases keep
-/// their `bounds`.
-pub fn bounds(targets: &Targets, images: &[f32], mut bounds: Bounds) -> Bounds {
-    let n = targets.n_pixels();
-    for view in 0..targets.n_views {
+/// Fewest phases of a view from which its background is estimated.
+const MIN_PHASES: usize = 3;
+
+/// Background of an image that a field leaves.
+struct Background {
+    image: usize,
+    /// Median over the view's phases, and what changes slowly from pixel to pixel around it, shares of the strongest change.
+    values: Vec<f32>,
+}
+
+/// Computes the background of each image that the field's `images` (`[image][pixel]`, shares of the strongest change) leave. Views
+/// of fewer than three phases are left out.
+fn backgrounds(targets: &Targets, images: &[f32]) -> Vec<Background> {
+    let of_view = |view: usize| {
         let of_view: Vec<usize> =
             targets.image_of.iter().skip(view).step_by(targets.n_views).flatten().copied().collect();
-        if of_view.len() < 3 {
-            continue;
+        if of_view.len() < MIN_PHASES {
+            return Vec::new();
         }
         let left: Vec<Image> = of_view.iter().map(|image| left(targets, images, *image)).collect();
         let level = level(&left);
-        let slow: Vec<Image> = left.par_iter().map(|left| slow(left, &level)).collect();
-        for (image, slow) in of_view.into_iter().zip(&slow) {
-            for (p, (level, slow)) in level.iter().zip(&slow.values).enumerate() {
-                let at = image * n + p;
-                let low = targets.images[at] - level - slow;
-                bounds.low[at] = low;
-                bounds.high[at] = targets.max[at].min(low + FREE_NOISE * targets.noise[at]).max(low);
+        let background = |(image, left): (&usize, &Image)| {
+            let slow = slow(left, &level, &targets.weight[image * targets.n_pixels()..]);
+            Background {
+                image: *image,
+                values: level.iter().zip(&slow.values).map(|(level, slow)| level + slow).collect(),
             }
+        };
+        of_view.par_iter().zip(&left).map(background).collect()
+    };
+    (0..targets.n_views).flat_map(of_view).collect()
+}
+
+/// Computes bounds from the background that the field's `images` (`[image][pixel]`, shares of the strongest change) leave. Views of
+/// fewer than three phases keep their `bounds`.
+pub fn bounds(targets: &Targets, images: &[f32], mut bounds: Bounds) -> Bounds {
+    let n = targets.n_pixels();
+    for Background { image, values } in backgrounds(targets, images) {
+        for (p, background) in values.iter().enumerate() {
+            let at = image * n + p;
+            let contrast = targets.contrast[image];
+            let low = (targets.images[at] - background) / contrast;
+            bounds.low[at] = low;
+            bounds.high[at] = targets.max[at].min(low + FREE_NOISE * targets.noise[at] / contrast).max(low);
         }
     }
     bounds
 }
 
-/// Returns an image minus the field's image.
+/// Returns, for each image, what the field's `images` and the background leave of it, shares of the strongest change, and 0 in hidden
+/// pixels; none for views of fewer than three phases.
+pub(super) fn remainders(targets: &Targets, images: &[f32]) -> Vec<Option<Vec<f32>>> {
+    let mut remainders = vec![None; targets.n_images];
+    let n = targets.n_pixels();
+    for Background { image, values } in backgrounds(targets, images) {
+        let of_pixel = |(p, background): (usize, &f32)| match image * n + p {
+            at if targets.weight[at] == 0.0 => 0.0,
+            at => targets.images[at] - targets.contrast[image] * images[at] - background,
+        };
+        remainders[image] = Some(values.iter().enumerate().map(of_pixel).collect());
+    }
+    remainders
+}
+
+/// Returns an image minus the field's image at the image's contrast.
 fn left(targets: &Targets, images: &[f32], image: usize) -> Image {
     let range = image * targets.n_pixels()..(image + 1) * targets.n_pixels();
-    let values = targets.images[range.clone()].iter().zip(&images[range]).map(|(y, d)| y - d).collect();
+    let contrast = targets.contrast[image];
+    let values = targets.images[range.clone()].iter().zip(&images[range]).map(|(y, d)| y - contrast * d).collect();
     Image { width: targets.width, height: targets.height, values }
 }
 
@@ -67,25 +106,26 @@ fn level(left: &[Image]) -> Vec<f32> {
     (0..n).into_par_iter().map(of).collect()
 }
 
-/// Returns the changes of wide areas relative to the median.
-fn slow(left: &Image, level: &[f32]) -> Image {
+/// Returns the changes of wide areas relative to the median. Hidden pixels, whose weight is 0, do not change.
+fn slow(left: &Image, level: &[f32], weight: &[f32]) -> Image {
     let (width, height) = (left.width, left.height);
-    let values = left.values.iter().zip(level).map(|(left, level)| left - level).collect();
+    let change = |((left, level), weight): ((&f32, &f32), &f32)| if *weight > 0.0 { left - level } else { 0.0 };
+    let values = left.values.iter().zip(level).zip(weight).map(change).collect();
     let change = Image { width, height, values };
     let side = width.min(height) as f64;
     blur(&median_filter(&change, opening_radius(SLOW_SHARE, width, height)), (SLOW_BLUR_SHARE * side) as f32)
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::gaussians::field::Units;
     use crate::gaussians::view::SplatView;
     use crate::geometry::{CArm, Geometry};
     use crate::methods::dynamic_gaussians::lengths::Lengths;
 
-    const SIDE: usize = 40;
-    const PHASES: usize = 10;
+    pub const SIDE: usize = 40;
+    pub const PHASES: usize = 10;
 
     /// Vessel and background of each phase: a vessel 3 pixels wide, which moves by a pixel at the first three phases, in front
     /// of a static chest; the middle of the image brightens slowly over the beat.
@@ -103,8 +143,8 @@ mod tests {
         (vessel, background)
     }
 
-    /// Targets from the minimum of each pixel over the phases.
-    fn targets(images: &[f32]) -> Targets {
+    /// Targets of images `[phase][view][pixel]`, from the minimum of each pixel over the phases.
+    pub fn targets(images: &[f32], n_views: usize) -> Targets {
         let geometry = CArm {
             primary_deg: 0.0,
             secondary_deg: 0.0,
@@ -115,7 +155,7 @@ mod tests {
             table_mm: [0.0; 3],
         };
         let units = Units { pixel: 0.01, strongest: 1.0 };
-        let n = SIDE * SIDE;
+        let (n, n_images) = (SIDE * SIDE * n_views, PHASES * n_views);
         let min = |p: usize| (0..PHASES).map(|t| images[t * n + p % n]).fold(f32::MAX, f32::min);
         let low: Vec<f32> = (0..images.len()).map(|p| images[p] - min(p)).collect();
         Targets {
@@ -123,15 +163,16 @@ mod tests {
             width: SIDE,
             height: SIDE,
             n_phases: PHASES,
-            n_views: 1,
-            views: vec![SplatView::new(&Geometry::CArm(geometry).rays(SIDE, SIDE).unwrap(), units); PHASES],
-            image_of: (0..PHASES).map(Some).collect(),
-            n_images: PHASES,
+            n_views,
+            views: vec![SplatView::new(&Geometry::CArm(geometry).rays(SIDE, SIDE).unwrap(), units); n_images],
+            image_of: (0..n_images).map(Some).collect(),
+            n_images,
             images: images.to_vec(),
             max: low.iter().map(|v| v + 1.0).collect(),
             high: low.iter().map(|v| v + 1.0).collect(),
             weight: vec![1.0; low.len()],
             noise: vec![0.01; low.len()],
+            contrast: vec![1.0; n_images],
             low,
             lengths: Lengths { factor: 1.0, smoothing: 1.0 },
             rest_phase: 0,
@@ -152,7 +193,7 @@ mod tests {
     fn bounds_come_closer_to_a_vessel_that_rests_at_most_phases() {
         let (vessel, background) = scene();
         let images: Vec<f32> = vessel.iter().zip(&background).map(|(v, b)| v + b).collect();
-        let targets = targets(&images);
+        let targets = targets(&images, 1);
         // A field that has found most of the vessel.
         let found: Vec<f32> = vessel.iter().map(|v| 0.8 * v).collect();
         let bounds = bounds(&targets, &found, before_it(&targets));
@@ -166,9 +207,47 @@ mod tests {
     #[test]
     fn too_few_phases_say_nothing_new() {
         let (vessel, _) = scene();
-        let mut targets = targets(&vessel);
+        let mut targets = targets(&vessel, 1);
         targets.image_of.iter_mut().skip(2).for_each(|image| *image = None);
         let bounds = bounds(&targets, &vec![0.3; vessel.len()], before_it(&targets));
         assert_eq!((bounds.low, bounds.high), (targets.low, targets.high));
+    }
+
+    #[test]
+    fn contrast_is_no_part_of_the_background() {
+        let (_, background) = scene();
+        // Narrower than the window of the median, and at rest.
+        let vessel: Vec<f32> = (0..background.len()).map(|p| if p % SIDE == 12 { 0.8 } else { 0.0 }).collect();
+        // Odd phases have less contrast.
+        let contrast: Vec<f32> = (0..PHASES).map(|t| if t % 2 == 0 { 1.2 } else { 0.8 }).collect();
+        let at = |p: usize| contrast[p / (SIDE * SIDE)] * vessel[p] + background[p];
+        let images: Vec<f32> = (0..vessel.len()).map(at).collect();
+        // Edges of the part that brightens are no part of the slow changes.
+        let inside = |p: usize| p % SIDE == 12 && (14..26).contains(&(p / SIDE));
+        let largest = |contrast: Vec<f32>| {
+            let targets = Targets { contrast, ..targets(&images, 1) };
+            let left = remainders(&targets, &vessel);
+            let pixels =
+                left.iter().flatten().flat_map(|image| (0..image.len()).filter(|p| inside(*p)).map(|p| image[p]));
+            pixels.fold(0f32, |max, v| max.max(v.abs()))
+        };
+        let (known, unknown) = (largest(contrast), largest(vec![1.0; PHASES]));
+        println!("{known} {unknown}");
+        assert!(unknown > 0.1 && known < 0.2 * unknown, "{known} against {unknown}");
+    }
+
+    #[test]
+    fn hidden_pixels_leave_nothing() {
+        let (vessel, _) = scene();
+        let mut targets = targets(&vec![1.0; vessel.len()], 1);
+        targets
+            .weight
+            .iter_mut()
+            .enumerate()
+            .for_each(|(p, weight)| *weight = f32::from(u8::from(p % SIDE >= SIDE / 2)));
+        let left = remainders(&targets, &vessel);
+        let hidden = |p: usize| p % SIDE < SIDE / 2;
+        let of = |image: &[f32]| (0..image.len()).filter(|p| hidden(*p)).all(|p| image[p] == 0.0);
+        assert!(left.iter().flatten().all(|image| of(image)));
     }
 }

@@ -61,6 +61,8 @@ pub struct Targets {
     pub weight: Vec<f32>,
     /// `[image][pixel]`: standard deviation of the noise, share of the strongest change.
     pub noise: Vec<f32>,
+    /// `[image]`: contrast of the vessels, by which the field's line integrals are multiplied where it is compared with the image.
+    pub contrast: Vec<f32>,
     /// Lengths of the settings on these images.
     pub lengths: Lengths,
     /// Phase at which the Gaussians of a deformable set rest.
@@ -138,6 +140,7 @@ impl Targets {
             high: Vec::new(),
             weight: Vec::new(),
             noise: Vec::new(),
+            contrast: Vec::new(),
             lengths: Lengths { factor: 1.0, smoothing: 1.0 },
             rest_phase: 0,
             places: Vec::new(),
@@ -153,15 +156,18 @@ impl Targets {
                     continue;
                 };
                 let above = image.values.iter().zip(&view.background.low.values).map(|(y, b)| y - b);
+                let contrast = dataset.contrast_at(view.view, phase as u32);
                 let share = |change: f32| (f64::from(change) / strongest) as f32;
+                let of_field = |change: f32| (f64::from(change) / (contrast * strongest)) as f32;
+                targets.contrast.push(contrast as f32);
                 targets.image_of[phase * motion.views.len() + slot] = Some(targets.n_images);
                 targets.n_images += 1;
                 let seen_by = SplatView::new(&dataset.heart_rays_at(view.view, phase as u32), units);
                 let after_phase = dataset.after_phase(view.view, phase as u32);
                 targets.views.push(SplatView { after_phase, ..seen_by });
                 targets.images.extend(image.values.iter().map(|y| share(*y)));
-                targets.low.extend(change.values.iter().map(|d| share(*d)));
-                targets.high.extend(above.map(share));
+                targets.low.extend(change.values.iter().map(|d| of_field(*d)));
+                targets.high.extend(above.map(of_field));
                 targets.weight.extend(&weights[slot]);
                 targets.noise.extend(view.background.noise.values.iter().map(|s| share(*s)));
             }

@@ -8,11 +8,10 @@ use crate::fitting::ledger::Ledger;
 use crate::fitting::losses::{SMALLER_STEPS, StepLoss};
 use crate::gaussians::field::{DynamicGaussians, GaussianFeed};
 use crate::gaussians::pictures::Pictures;
-use crate::geometry::ViewRays;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
 use crate::kernels::tuning::Tuning;
-use crate::methods::dynamic_gaussians::data::GaussianData;
+use crate::methods::dynamic_gaussians::data::{GaussianData, Shot};
 use crate::methods::dynamic_gaussians::fit::GaussianFit;
 use std::any::Any;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -25,8 +24,8 @@ pub struct GaussiansFit {
     feed: GaussianFeed,
     /// Whether the field of earlier data is shown, until the fit has a better one.
     shows_earlier: bool,
-    /// View of each training image, and its time, counted in phases.
-    shots: Vec<(ViewRays, f64)>,
+    /// Circumstances of each training image.
+    shots: Vec<Shot>,
     fields: FieldsFit,
     /// Whether, since the last call of [`Fit::new_objective`], the static field or the fit to all pixels has begun.
     has_new_objective: bool,
@@ -125,9 +124,9 @@ impl GaussiansFit {
         let data = self.fields.data();
         let (width, pixels) = (data.setup.image_width as usize, data.setup.n_pixels as usize);
         let mut remaining = data.images.clone();
-        for ((rays, phases), image) in self.shots.iter().zip(remaining.chunks_mut(pixels)) {
-            let drawn = pictures.draw_at(rays, (width, pixels / width), *phases)?;
-            image.iter_mut().zip(drawn).for_each(|(y, drawn)| *y -= drawn);
+        for (shot, image) in self.shots.iter().zip(remaining.chunks_mut(pixels)) {
+            let drawn = pictures.draw_at(&shot.rays, (width, pixels / width), shot.phases)?;
+            image.iter_mut().zip(drawn).for_each(|(y, drawn)| *y -= shot.contrast * drawn);
         }
         Ok(remaining)
     }

@@ -59,6 +59,11 @@ impl SoftMotion {
         let series = Series::of(dataset);
         let views: Vec<ViewEvidence> =
             series.par_iter().map(|s| ViewEvidence::new(s).on_canvas(dataset.canvas())).collect();
+        SoftMotion::carved(views, dataset, half, resolution)
+    }
+
+    /// Carves by evidence that is known already.
+    pub fn carved(views: Vec<ViewEvidence>, dataset: &Dataset, half: f64, resolution: usize) -> SoftMotion {
         let hull = SoftHull::carve(dataset, &views, half, resolution.next_multiple_of(2));
         SoftMotion { views, hull }
     }
