@@ -144,6 +144,9 @@ pub fn angles_deg_of(axis: DVec3) -> [f64; 2] {
     [axis.y.atan2(-axis.x).to_degrees(), axis.z.clamp(-1.0, 1.0).asin().to_degrees()]
 }
 
+/// Accepted distances and pixel pitches of a C-arm, mm.
+const LENGTHS_MM: std::ops::RangeInclusive<f64> = 1e-4..=1e5;
+
 impl CArm {
     fn rays(&self, width: usize, height: usize) -> Result<ViewRays, (String, String)> {
         let positive = [
@@ -153,8 +156,11 @@ impl CArm {
             ("pixel_mm[1]", self.pixel_mm[1]),
         ];
         for (field, value) in positive {
-            if !(value.is_finite() && value > 0.0 && value < 1e5) {
-                return Err((field.into(), format!("{value:?} is not a positive length in mm, below 100 m")));
+            if !LENGTHS_MM.contains(&value) {
+                return Err((
+                    field.into(),
+                    format!("{value:?} is not a positive length in mm, from 0.0001 mm to 100 m"),
+                ));
             }
         }
         for (field, value) in [("primary_deg", self.primary_deg), ("secondary_deg", self.secondary_deg)] {

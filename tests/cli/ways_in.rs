@@ -181,6 +181,7 @@ fn a_file_states_what_options_state_of_pictures() {
     refused("sid_mm = 1100", "sid = 1100", &["line 14", "sid"]);
     refused("sod_mm = 750", "", &["view 1: sod_mm: is missing"]);
     refused("pixel_mm = [2, 2.5]", "pixel_mm = [2]", &["line 3", "two numbers"]);
+    refused("pixel_mm = [2, 2.5]", "pixel_mm = [2, 1e-300]", &["view 1: pixel_mm[1]: 1e-300"]);
     refused("fps = 10", "fps = -10", &["view 1: fps: -10"]);
     refused("[0, 0.3, 0.6]", "[0, 0.3, 0.1]", &["view 1: r_peaks_s", "0.1"]);
     refused("[all]", "still = true\n[all]", &["view 1: r_peaks_s", "still = true"]);

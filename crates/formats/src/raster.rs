@@ -44,6 +44,8 @@ fn filter(image: &Image, radius: usize, neutral: f32, pick: impl Fn(f32, f32) ->
 /// Filters along rows with three comparisons per pixel for any radius (van Herk 1992): each window is the end of one block of
 /// its length and the beginning of the next.
 fn filter_rows(image: &Image, radius: usize, neutral: f32, pick: &impl Fn(f32, f32) -> f32) -> Image {
+    // A window from any pixel holds the whole row with this radius.
+    let radius = radius.min(image.width);
     let window = 2 * radius + 1;
     let padded = (image.width + 2 * radius).next_multiple_of(window);
     let (mut line, mut ends) = (vec![neutral; padded], vec![neutral; padded]);
@@ -123,7 +125,7 @@ mod tests {
         let image = Image { width: w, height: h, values };
         let within =
             |centre: usize, radius: usize, end: usize| centre.saturating_sub(radius)..(centre + radius + 1).min(end);
-        for radius in [0, 1, 2, 3, 6, 20] {
+        for radius in [0, 1, 2, 3, 6, 20, usize::MAX / 2] {
             let picked = |x: usize, y: usize, first: f32, pick: fn(f32, f32) -> f32| {
                 let rows = within(y, radius, h).flat_map(|y| within(x, radius, w).map(move |x| (x, y)));
                 rows.map(|(x, y)| image.values[y * w + x]).fold(first, pick)
