@@ -6,10 +6,11 @@
 //! heart breathes, a displacement of the heart per frame. The component that no image determines is removed ([`gauge`]),
 //! and a correction is kept only if it predicts phases it was not fitted to ([`choose`]).
 
+pub mod adjustment;
 pub mod choose;
 pub mod correction;
 pub mod gauge;
-mod linear;
+pub(crate) mod linear;
 pub mod observed;
 pub mod pose;
 pub mod profiles;
@@ -24,6 +25,7 @@ use crate::error::{Error, Result};
 use crate::geometry::{MM_PER_UNIT, lps_mm_from_world};
 use crate::scan::canvas::corner;
 use crate::scan::dataset::Dataset;
+use adjustment::Adjusted;
 use choose::{Correction, Validated, best, fit, misfit, validate};
 use correction::{Calibration, FrameCorrection, ViewCorrection};
 use gauge::{FrameRays, RigidMotion, common_motion};
@@ -81,6 +83,26 @@ pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
     }
     let candidates = candidates(mode, config.follows_breath(), &mut notes);
     Ok(Calibrator { dataset, observed: &observed, notes }.choose(&candidates))
+}
+
+/// Returns a calibration after an adjustment of its views: with the adjusted poses where they were accepted, and the record.
+///
+/// # Errors
+/// [`Error::Internal`] when the adjustment belongs to other views.
+pub fn adjusted(dataset: &Dataset, calibration: Calibration, adjusted: Adjusted) -> Result<Calibration> {
+    let Adjusted { views, poses, record } = adjusted;
+    let mut notes = vec![record.describe()];
+    if !record.accepted {
+        notes.splice(0..0, calibration.notes);
+        return Ok(Calibration { adjustment: Some(record), notes, ..calibration });
+    }
+    let observed = Observed::new(dataset);
+    if observed.views != views {
+        return Err(Error::Internal("views were adjusted that are not calibrated".into()));
+    }
+    let calibrator = Calibrator { dataset, observed: &observed, notes };
+    let described = calibrator.described(Correction::Breathing, &poses, None, calibration.tried);
+    Ok(Calibration { adjustment: Some(record), ..described })
 }
 
 /// Vessel pixels of a view at one phase, and the part that the other views explain before and after a correction.
@@ -240,6 +262,19 @@ impl Calibrator<'_> {
             ));
             return Calibration { tried, notes: self.notes, ..Calibration::none(None) };
         }
+        self.described(correction, poses, repeatability_px, tried)
+    }
+
+    /// Describes poses as corrections of the views and frames.
+    fn described(
+        self,
+        correction: Correction,
+        poses: &Poses,
+        repeatability_px: Option<f64>,
+        tried: Vec<(Correction, f64)>,
+    ) -> Calibration {
+        let stated = Poses::stated(self.observed.views.len(), self.observed.n_phases());
+        let explained = [&stated, poses].map(|poses| silhouettes::explained(self.observed, poses));
         let moved = self.motion(&stated, poses);
         let disagreement_px = self.distance_px(&stated, poses);
         let view = |slot: usize| self.view(slot, poses, &moved);
@@ -254,6 +289,7 @@ impl Calibrator<'_> {
             tried,
             explained,
             explained_by_chance: Some(silhouettes::explained_by_chance(self.observed, poses)),
+            adjustment: None,
             notes: self.notes,
         };
         calibration.describe();
@@ -293,6 +329,7 @@ impl Calibrator<'_> {
                 view: self.observed.views[slot],
                 phase: t as u32,
                 heart_shift_mm: (poses.heart[slot][t] * MM_PER_UNIT).to_array(),
+                contrast: 1.0 + poses.gains[slot][t],
             })
         };
         (0..self.observed.views.len()).flat_map(of_view).collect()

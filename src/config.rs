@@ -21,8 +21,8 @@ mod x_gaussian;
 use crate::error::{Error, Result};
 use crate::files;
 pub use forms::{
-    CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, R2Integral, R2Start, StaticData,
-    StaticForm,
+    AdjustMode, CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, R2Integral, R2Start,
+    StaticData, StaticForm,
 };
 use method::MethodKind;
 use sections::{

@@ -1,5 +1,6 @@
 //! The correction of the views, the reasons for it and its outcome: `calibration.json`.
 
+use crate::calibrate::adjustment::Adjustment;
 use crate::calibrate::choose::Correction;
 use crate::error::{Error, Result};
 use crate::files;
@@ -45,6 +46,17 @@ pub struct FrameCorrection {
     pub phase: u32,
     /// Displacement along (posterior, left, superior), mm.
     pub heart_shift_mm: [f64; 3],
+    /// Contrast of the vessels in this frame, as a multiple of the mean over the frames.
+    #[serde(default = "mean_contrast", skip_serializing_if = "is_mean_contrast")]
+    pub contrast: f64,
+}
+
+fn mean_contrast() -> f64 {
+    1.0
+}
+
+fn is_mean_contrast(contrast: &f64) -> bool {
+    *contrast == 1.0
 }
 
 /// Outcome of the self-calibration.
@@ -70,6 +82,9 @@ pub struct Calibration {
     /// Share that would be explained by chance, with the vessels of a view displaced; `None` where it was not determined.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub explained_by_chance: Option<f64>,
+    /// Adjustment with the field in the loop; `None` where it was not tried.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub adjustment: Option<Adjustment>,
     /// Notes on what was done and why.
     pub notes: Vec<String>,
 }
@@ -86,6 +101,7 @@ impl Calibration {
             tried: Vec::new(),
             explained: [0.0; 2],
             explained_by_chance: None,
+            adjustment: None,
             notes: note.into_iter().collect(),
         }
     }
@@ -138,7 +154,10 @@ impl Dataset {
         }
         for c in &calibration.frames {
             let frames = corrected.frames.iter_mut().filter(|f| (f.view, f.phase) == (c.view, c.phase));
-            frames.for_each(|f| f.heart_shift_mm = [0, 1, 2].map(|k| f.heart_shift_mm[k] + c.heart_shift_mm[k]));
+            frames.for_each(|f| {
+                f.heart_shift_mm = [0, 1, 2].map(|k| f.heart_shift_mm[k] + c.heart_shift_mm[k]);
+                f.contrast *= c.contrast;
+            });
         }
         Ok(corrected)
     }

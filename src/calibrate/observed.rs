@@ -91,6 +91,11 @@ pub(crate) fn binned_series(dataset: &Dataset) -> Vec<Series> {
     Series::of(&coarsened(dataset, factor(dataset)))
 }
 
+/// Returns the training frames of a dataset, binned as for [`Observed`].
+pub(crate) fn coarsened_for_calibration(dataset: &Dataset) -> Dataset {
+    coarsened(dataset, factor(dataset))
+}
+
 /// Bins the training frames.
 fn coarsened(dataset: &Dataset, factor: usize) -> Dataset {
     let frame = |f: &Frame| Frame { integrals: binned(&f.integrals, dataset.width, factor), mask: None, ..f.clone() };

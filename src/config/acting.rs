@@ -10,7 +10,7 @@ use crate::error::{Error, Result};
 fn is_key_of(preset: Preset, key: &str) -> bool {
     let of_method = || Config::preset(preset).method().settings().is_key(preset, key);
     match key.split_once('.') {
-        None | Some(("calibrate", _)) | Some(("march", "render_samples")) => true,
+        None | Some(("calibrate", "mode")) | Some(("march", "render_samples")) => true,
         Some(("train", name)) if !["rays", "motion_share", "validate_images"].contains(&name) => true,
         Some(_) => of_method(),
     }

@@ -3,8 +3,8 @@
 use crate::config::fields::TENSOR_KEYS;
 use crate::config::method::MethodSettings;
 use crate::config::section::section;
-use crate::config::sections::{DynamicField, March, Occupancy, StaticField, Train};
-use crate::config::{Config, GaussianForm, Preset, nert_ca};
+use crate::config::sections::{Calibrate, DynamicField, March, Occupancy, StaticField, Train};
+use crate::config::{AdjustMode, Config, GaussianForm, Preset, nert_ca};
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -164,6 +164,7 @@ pub(super) fn fast() -> Config {
             validate_every: 0,
             ..mlp.train
         },
+        calibrate: Calibrate { adjust: AdjustMode::Auto, ..mlp.calibrate },
         march: March { dynamic_samples: 2, ..mlp.march },
         // Three or four views do not determine how a low-rank field looks from other angles; smoothness does. Few iterations
         // need large steps.
@@ -201,6 +202,7 @@ impl MethodSettings for Settings {
     }
 
     fn is_key(&self, _: Preset, key: &str) -> bool {
-        TENSOR_KEYS.contains(&key) || ["gaussians.form", "gaussians.iterations", "gaussians.count"].contains(&key)
+        TENSOR_KEYS.contains(&key)
+            || ["calibrate.adjust", "gaussians.form", "gaussians.iterations", "gaussians.count"].contains(&key)
     }
 }

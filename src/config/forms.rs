@@ -123,6 +123,19 @@ pub enum CalibrateMode {
     Breathing,
 }
 
+/// Adjustment of the calibrated geometry with the field in the loop.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
+pub enum AdjustMode {
+    /// Adjustment where calibration is automatic and the field of a fit does not explain the images, if it explains them clearly
+    /// better afterwards.
+    Auto,
+    /// No adjustment.
+    #[default]
+    Off,
+}
+
 /// Data that the dynamic field is fitted to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

@@ -4,8 +4,8 @@ use crate::config::fields::{NETWORK_KEYS, TENSOR_KEYS};
 use crate::config::method::MethodSettings;
 use crate::config::sections::{Adam, Calibrate, DynamicField, Hull, Loss, March, Occupancy, StaticField, Train};
 use crate::config::{
-    CalibrateMode, Config, Decay, DynamicForm, DynamicTarget, OcclusionRegion, Preset, StaticForm, dynamic_gaussians,
-    nerf_ca, r2_gaussian, sax_nerf, x_gaussian,
+    AdjustMode, CalibrateMode, Config, Decay, DynamicForm, DynamicTarget, OcclusionRegion, Preset, StaticForm,
+    dynamic_gaussians, nerf_ca, r2_gaussian, sax_nerf, x_gaussian,
 };
 
 /// Returns the method as the paper states it (section 4).
@@ -94,7 +94,7 @@ pub(super) fn paper() -> Config {
 
 /// Returns the setting that takes the geometry from the dataset, as in the paper.
 pub(super) fn uncalibrated() -> Calibrate {
-    Calibrate { mode: CalibrateMode::Off }
+    Calibrate { mode: CalibrateMode::Off, adjust: AdjustMode::Off }
 }
 
 /// Applies the differences between the authors' public code and the paper.
@@ -128,7 +128,7 @@ pub(super) fn fast_mlp() -> Config {
             checkpoint_every: 400,
             ..paper.train
         },
-        calibrate: Calibrate { mode: CalibrateMode::Auto },
+        calibrate: Calibrate { mode: CalibrateMode::Auto, adjust: AdjustMode::Off },
         march: March {
             static_samples: 32,
             dynamic_samples: 128,

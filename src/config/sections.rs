@@ -8,7 +8,7 @@ pub use crate::config::r2_gaussian::R2;
 pub use crate::config::sax_nerf::Sax;
 pub use crate::config::x_gaussian::X;
 
-use crate::config::forms::CalibrateMode;
+use crate::config::forms::{AdjustMode, CalibrateMode};
 use crate::config::section::section;
 use serde::{Deserialize, Serialize};
 
@@ -46,6 +46,8 @@ section! {
     Calibrate, "calibrate" {
         /// Corrections to be estimated.
         mode: CalibrateMode,
+        /// Adjustment of angles, positions, breathing and contrasts with the Gaussians in the loop, after the calibration.
+        #[serde(default)] adjust: AdjustMode,
     }
 }
 

@@ -1,6 +1,8 @@
 //! Traits behind which each method stands: its entry in the registry, the data of a fit, the fit, and the state that a checkpoint
 //! keeps of it.
 
+use crate::calibrate::adjustment::Adjusted;
+use crate::calibrate::correction::Calibration;
 use crate::config::Config;
 use crate::config::method::MethodKind;
 use crate::error::{Error, Result};
@@ -43,6 +45,14 @@ pub trait Method: Sync {
     /// [`Error::Data`] naming what is missing, misshapen or not finite.
     fn read(&self, sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit>;
 
+    /// Adjusts the calibrated geometry of views with the field in the loop; `None` where the method or the data do not allow it.
+    ///
+    /// # Errors
+    /// Device errors, and errors of `observe`.
+    fn adjust(&self, _task: &AdjustTask<'_>, _observe: &mut Observe<'_>) -> Result<Option<Adjusted>> {
+        Ok(None)
+    }
+
     /// Returns the rays of an iteration; 0 for a method that draws whole images.
     fn rays_per_iteration(&self, config: &Config) -> u32;
 
@@ -63,6 +73,22 @@ pub trait Method: Sync {
         false
     }
 }
+
+/// Views whose calibrated geometry is to be adjusted.
+#[derive(Clone, Copy)]
+pub struct AdjustTask<'a> {
+    /// Device of the fits.
+    pub gpu: &'a Gpu,
+    /// Configuration of the run.
+    pub config: &'a Config,
+    /// Dataset with the geometry as stated.
+    pub dataset: &'a Dataset,
+    /// Calibration of its views.
+    pub calibration: &'a Calibration,
+}
+
+/// Receives the share of a work that is done; an error ends the work.
+pub type Observe<'a> = dyn FnMut(f64) -> Result<()> + 'a;
 
 /// Fit that a method has prepared.
 pub struct PlannedFit {

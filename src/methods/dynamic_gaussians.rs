@@ -1,6 +1,7 @@
 //! Gaussians as the dynamic field in front of a static tensor field, the method of the preset `fast`: the Gaussians are fitted first,
 //! to what moves in the images, then the static field to what they leave of the images.
 
+pub mod adjust;
 pub mod carried;
 pub mod coarse;
 pub mod data;
@@ -21,16 +22,21 @@ pub mod start;
 mod stiffness;
 pub(crate) mod target_buffers;
 pub mod targets;
+#[cfg(test)]
+mod test_targets;
 pub mod trainer;
 pub mod twin;
 
+use crate::calibrate::adjustment::Adjusted;
 use crate::config::method::MethodKind;
 use crate::config::sections::Deformable;
 use crate::config::{Config, GaussianForm};
 use crate::error::Result;
 use crate::fields::data::lower_rates;
 use crate::fields::state;
-use crate::fitting::fit::{Fit, FitData, FitStart, Method, PlannedFit, SavedAt, SavedFit, TimedFit};
+use crate::fitting::fit::{
+    AdjustTask, Fit, FitData, FitStart, Method, Observe, PlannedFit, SavedAt, SavedFit, TimedFit,
+};
 use crate::gaussians::blobs::BlobKernels;
 use crate::gaussians::field::SMALLER_STEPS;
 use crate::gaussians::pictures::into_buffers;
@@ -63,6 +69,10 @@ impl Method for DynamicGaussiansMethod {
     fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
         let data = GaussianData::new(config, dataset, notes)?;
         Ok(PlannedFit { scene: data.fields.scene.clone(), data: Box::new(data) })
+    }
+
+    fn adjust(&self, task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result<Option<Adjusted>> {
+        adjust::adjust(task, observe)
     }
 
     fn read(&self, sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {

@@ -35,6 +35,11 @@ pub enum Event {
         #[serde(flatten)]
         check: Box<Check>,
     },
+    /// Adjustment of the views with the field in the loop, before the run starts; not a line of `metrics.jsonl`.
+    Adjusting {
+        /// Share of the adjustment that is done, 0 to 1.
+        share: f64,
+    },
     /// Preparation before the first iteration: Gaussians are placed and followed through the beat; not a line of
     /// `metrics.jsonl`.
     Preparing {

@@ -29,7 +29,7 @@ impl MetricsLog {
     }
 
     pub(super) fn write(&mut self, event: &Event) -> Result<()> {
-        if matches!(event, Event::Preparing { .. }) {
+        if matches!(event, Event::Preparing { .. } | Event::Adjusting { .. }) {
             return Ok(());
         }
         if self.is_removed() {

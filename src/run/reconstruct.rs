@@ -3,18 +3,20 @@
 //! A run directory holds `config.toml`, `metrics.jsonl` (one object per line), the newest checkpoints, `calibration.json`
 //! with what was corrected of the views' geometry and, when finished, `report/` with the evaluation and pictures.
 
-use crate::calibrate::calibrate;
 use crate::calibrate::choose::Correction;
 use crate::calibrate::correction::Calibration;
 use crate::calibrate::gauge::RigidMotion;
+use crate::calibrate::{adjusted, calibrate};
 use crate::check;
 use crate::checkpoint::{self, Checkpoint};
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::files;
+use crate::fitting::fit::AdjustTask;
 use crate::fitting::losses::LargeLoss;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
+use crate::methods;
 use crate::plan::Plan;
 use crate::run::events::Event;
 use crate::run::log::MetricsLog;
@@ -72,7 +74,7 @@ pub fn reconstruct(
         files::write_atomic(&options.run.join(CONFIG), config.to_toml()?.as_bytes())?;
     }
     let checked = if options.resume { None } else { checked(dataset) };
-    let Calibrated { dataset, carried, calibration } = calibrated(config, dataset, options)?;
+    let Calibrated { dataset, carried, calibration } = calibrated(gpu, config, dataset, options, observe)?;
     let dataset = &dataset;
     let trainer = if options.resume {
         let saved = Checkpoint::read(&checkpoint::newest(options.run)?)?;
@@ -151,11 +153,28 @@ struct Calibrated {
 }
 
 /// Returns the dataset with the geometry of the run: calibrated now, or when the run was begun.
-fn calibrated(config: &Config, dataset: &Dataset, options: &RunOptions<'_>) -> Result<Calibrated> {
+fn calibrated(
+    gpu: &Gpu,
+    config: &Config,
+    dataset: &Dataset,
+    options: &RunOptions<'_>,
+    observe: &mut dyn FnMut(&Event),
+) -> Result<Calibrated> {
     let calibration = if options.resume {
         Calibration::read(options.run)?.unwrap_or_else(|| Calibration::none(None))
     } else {
-        let calibration = calibrate(dataset, config)?;
+        let mut calibration = calibrate(dataset, config)?;
+        let task = AdjustTask { gpu, config, dataset, calibration: &calibration };
+        let mut observe = |share: f64| match options.cancel.load(Ordering::Relaxed) {
+            true => Err(Error::Interrupted),
+            false => {
+                observe(&Event::Adjusting { share });
+                Ok(())
+            }
+        };
+        if let Some(outcome) = methods::of(config).adjust(&task, &mut observe)? {
+            calibration = adjusted(dataset, calibration, outcome)?;
+        }
         calibration.write(options.run)?;
         calibration
     };

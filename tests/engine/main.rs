@@ -12,6 +12,7 @@ mod golden_file;
 #[path = "../common/root.rs"]
 mod root;
 
+mod adjustment;
 mod architecture;
 mod between_phases;
 mod calibration;

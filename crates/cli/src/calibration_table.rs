@@ -28,6 +28,24 @@ pub fn rows(calibration: &Calibration) -> Vec<Vec<String>> {
     calibration.views.iter().map(row).collect()
 }
 
+/// Headings of the table of what was corrected frame by frame; the table has one row per view.
+pub const FRAME_COLUMNS: [&str; 4] = ["view", "frames", "heart displaced by up to, mm", "contrast"];
+
+/// Returns the rows of the table of frames; none where only views were corrected.
+pub fn frame_rows(calibration: &Calibration) -> Vec<[String; 4]> {
+    let row = |view: usize| {
+        let frames: Vec<_> = calibration.frames.iter().filter(|frame| frame.view == view).collect();
+        let shift = |[x, y, z]: [f64; 3]| (x * x + y * y + z * z).sqrt();
+        let farthest = frames.iter().map(|frame| shift(frame.heart_shift_mm)).fold(0.0, f64::max);
+        let low = frames.iter().map(|frame| frame.contrast).fold(f64::INFINITY, f64::min);
+        let high = frames.iter().map(|frame| frame.contrast).fold(0.0, f64::max);
+        (!frames.is_empty()).then(|| {
+            [view.to_string(), frames.len().to_string(), format!("{farthest:.2}"), format!("{low:.2} to {high:.2}")]
+        })
+    };
+    calibration.views.iter().filter_map(|v| row(v.view)).collect()
+}
+
 /// Describes how well the views agree before and after the calibration.
 pub fn legend(calibration: &Calibration) -> String {
     let [before, after] = calibration.explained.map(|share| 100.0 * share);

@@ -257,6 +257,7 @@ impl Page<'_> {
 
     fn calibration(&self) -> Result<Markup> {
         let Some(calibration) = self.calibration.as_ref().filter(|c| !c.views.is_empty()) else { return Ok(html! {}) };
+        let frames = calibration_table::frame_rows(calibration);
         Ok(html! {
             h2 { "Correction of the views" }
             p.lead { "These corrections are added to the geometry that the dataset states. \
@@ -265,6 +266,15 @@ impl Page<'_> {
                 tr { @for column in &calibration_table::COLUMNS { th { (column.heading.join(" ").trim()) } } }
                 @for cells in calibration_table::rows(calibration) { tr { @for cell in cells { td { (cell) } } } }
             } }
+            @if let Some(adjustment) = &calibration.adjustment { p.lead { "Adjustment: " (adjustment.describe()) "." } }
+            @if !frames.is_empty() {
+                p.lead { "Corrections of the frames of each view: displacement of the heart by breathing, and contrast of the vessels \
+                          as a multiple of the mean." }
+                div.scroll { table {
+                    tr { @for heading in calibration_table::FRAME_COLUMNS { th { (heading) } } }
+                    @for cells in frames { tr { @for cell in cells { td { (cell) } } } }
+                } }
+            }
             @if !self.silhouettes.is_empty() {
                 p.lead { "Vessel pixels of each training view with the stated (left) and the corrected geometry \
                           (right): green where all other views also show vessels on the ray, red where they do not." }

@@ -78,6 +78,7 @@ pub fn show_progress() -> impl FnMut(&Event) {
                 say(&bar, "warning: `nertca-vk check DATA` looks for the usual mistakes".into());
             }
         }
+        Event::Adjusting { share } => bar.set_message(format!("adjusting views, {:.0} %", 100.0 * share)),
         Event::Preparing { share } => bar.set_message(format!("initialising Gaussians, {:.0} %", 100.0 * share)),
         Event::Progress { loss, psnr, iterations_per_s, left_s, .. } => {
             bar.set_position(u64::from(loss.step));

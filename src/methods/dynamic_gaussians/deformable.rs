@@ -39,6 +39,8 @@ pub struct DeformableTrainer {
     n: u32,
     iterations: Iterations,
     step: u32,
+    /// Whether short components that the images do not support are dropped at the end.
+    prunes: bool,
 }
 
 /// Setup, schedule and buffers of iterations of one kind: the joint fit of everything, or the tracking of a phase.
@@ -112,6 +114,7 @@ impl DeformableTrainer {
             n,
             iterations,
             step: 0,
+            prunes: true,
         })
     }
 
@@ -144,6 +147,11 @@ impl DeformableTrainer {
         recording.fill(&self.joint.grid.motion_grid_first, 0);
         recording.fill(&self.joint.grid.motion_grid_second, 0);
         Ok(self.gpu.wait(recording.finish()?.submit()?)?)
+    }
+
+    /// Keeps short components that the images do not support, as happens to vessels where poses are wrong.
+    pub(super) fn keep_unsupported(&mut self) {
+        self.prunes = false;
     }
 
     /// Iterations done, those of the sets per phase and of tracking not counted.
@@ -233,7 +241,9 @@ impl DeformableTrainer {
         self.step += self.iterations.run(&self.gpu, first, stop)?;
         if setup::parts_from_strays(&self.config.gaussians, self.step) {
             self.drop_strays()?;
-            self.drop_unsupported()?;
+            if self.prunes {
+                self.drop_unsupported()?;
+            }
         }
         losses(&self.gpu, &self.joint.targets.gaussian_ring, first..self.step, SMALLER_STEPS)
     }
@@ -324,6 +334,21 @@ impl DeformableTrainer {
     /// Device errors.
     pub fn images(&self) -> Result<Vec<f32>> {
         self.images_of((&self.particles, &self.own), self.n)
+    }
+
+    /// Images of the present field that other `views` see, one for each image of the targets.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub(super) fn images_through(&self, views: &[SplatView]) -> Result<Vec<f32>> {
+        let upload = |views: &[SplatView]| {
+            let views: Vec<GaussianView> = views.iter().map(SplatView::to_device).collect();
+            self.gpu.upload(&self.joint.targets.gaussian_views, 0, &views)
+        };
+        upload(views)?;
+        let images = self.images();
+        upload(&self.targets.views)?;
+        images
     }
 
     /// Images of `n` Gaussians that move on the present grid.

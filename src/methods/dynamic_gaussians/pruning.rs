@@ -103,7 +103,7 @@ impl Judge<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::methods::dynamic_gaussians::remainder::tests::{PHASES, SIDE, targets};
+    use crate::methods::dynamic_gaussians::test_targets::{PHASES, SIDE, targets};
     use crate::random::normal;
 
     const VIEWS: usize = 3;

@@ -117,15 +117,9 @@ fn slow(left: &Image, level: &[f32], weight: &[f32]) -> Image {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+mod tests {
     use super::*;
-    use crate::gaussians::field::Units;
-    use crate::gaussians::view::SplatView;
-    use crate::geometry::{CArm, Geometry};
-    use crate::methods::dynamic_gaussians::lengths::Lengths;
-
-    pub const SIDE: usize = 40;
-    pub const PHASES: usize = 10;
+    use crate::methods::dynamic_gaussians::test_targets::{PHASES, SIDE, targets};
 
     /// Vessel and background of each phase: a vessel 3 pixels wide, which moves by a pixel at the first three phases, in front
     /// of a static chest; the middle of the image brightens slowly over the beat.
@@ -141,44 +135,6 @@ pub(super) mod tests {
             }
         }
         (vessel, background)
-    }
-
-    /// Targets of images `[phase][view][pixel]`, from the minimum of each pixel over the phases.
-    pub fn targets(images: &[f32], n_views: usize) -> Targets {
-        let geometry = CArm {
-            primary_deg: 0.0,
-            secondary_deg: 0.0,
-            sid_mm: 1000.0,
-            sod_mm: 700.0,
-            pixel_mm: [1.0; 2],
-            offset_mm: [0.0; 2],
-            table_mm: [0.0; 3],
-        };
-        let units = Units { pixel: 0.01, strongest: 1.0 };
-        let (n, n_images) = (SIDE * SIDE * n_views, PHASES * n_views);
-        let min = |p: usize| (0..PHASES).map(|t| images[t * n + p % n]).fold(f32::MAX, f32::min);
-        let low: Vec<f32> = (0..images.len()).map(|p| images[p] - min(p)).collect();
-        Targets {
-            units,
-            width: SIDE,
-            height: SIDE,
-            n_phases: PHASES,
-            n_views,
-            views: vec![SplatView::new(&Geometry::CArm(geometry).rays(SIDE, SIDE).unwrap(), units); n_images],
-            image_of: (0..n_images).map(Some).collect(),
-            n_images,
-            images: images.to_vec(),
-            max: low.iter().map(|v| v + 1.0).collect(),
-            high: low.iter().map(|v| v + 1.0).collect(),
-            weight: vec![1.0; low.len()],
-            noise: vec![0.01; low.len()],
-            contrast: vec![1.0; n_images],
-            low,
-            lengths: Lengths { factor: 1.0, smoothing: 1.0 },
-            rest_phase: 0,
-            places: vec![Vec::new(); PHASES],
-            cell: 1.0,
-        }
     }
 
     fn before_it(targets: &Targets) -> Bounds {

@@ -32,7 +32,7 @@ impl Targets {
 mod tests {
     use super::*;
     use crate::config::{Config, Preset};
-    use crate::methods::dynamic_gaussians::remainder::tests::{PHASES, SIDE, targets};
+    use crate::methods::dynamic_gaussians::test_targets::{PHASES, SIDE, targets};
 
     #[test]
     fn motion_is_stiff_with_few_noisy_views() {

@@ -1,0 +1,194 @@
+//! Adjusts the geometry of views with the field in the loop (bundle adjustment): Gaussians whose motion cannot absorb errors of the
+//! poses are fitted, then the poses are moved towards what the field leaves of the images, a few times.
+
+pub mod poses;
+pub mod residual;
+pub mod step;
+
+use crate::calibrate::adjustment::{Adjusted, Adjustment};
+use crate::calibrate::observed::coarsened_for_calibration;
+use crate::calibrate::pose::{Poses, ViewPose};
+use crate::config::{AdjustMode, CalibrateMode, Config, GaussianForm};
+use crate::error::{Error, Result};
+use crate::evidence::ratios::ViewEvidence;
+use crate::evidence::series::Series;
+use crate::fields::scale::dynamic_half;
+use crate::fitting::fit::{AdjustTask, Observe};
+use crate::gpu::device::Gpu;
+use crate::methods::dynamic_gaussians::data::SOFT_HULL_CELLS;
+use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
+use crate::methods::dynamic_gaussians::targets::Targets;
+use poses::Stands;
+use rayon::prelude::*;
+use residual::misfit;
+use step::FieldInLoop;
+
+/// Gauss-Newton steps per fit.
+const STEPS: usize = 3;
+/// Penalty on squared differences of neighbouring nodes while poses are adjusted.
+const SMOOTHNESS: f64 = 0.02;
+
+/// Fits of one kind, each followed by a step of the poses.
+struct Stage {
+    /// Minimum scale of the Gaussians, pixels of the settings.
+    min_scale: f64,
+    /// Number of Gaussians seeded per phase.
+    count: u32,
+    /// Maximum number of fits.
+    cycles: u32,
+}
+
+/// Broad Gaussians first: their images still overlap those of the vessels when poses are far off.
+const STAGES: [Stage; 2] =
+    [Stage { min_scale: 1.2, count: 120, cycles: 2 }, Stage { min_scale: 0.8, count: 250, cycles: 3 }];
+/// Factor on the change of the poses in a cycle, except in the last one: a field holds back part of the change.
+const FARTHER: f64 = 1.6;
+/// Change of the poses in a cycle, pixels, below which a stage is over.
+const SETTLED_PX: f64 = 0.05;
+
+/// Misfit up to which the poses are right, as far as the images show.
+const SMALL_MISFIT: f64 = 0.12;
+/// Misfit from which on noise outweighs the vessels.
+const LARGE_MISFIT: f64 = 1.0;
+/// Share of the misfit that an accepted adjustment leaves at most.
+const ACCEPTED: f64 = 0.95;
+/// Difference of the seeds of one fit and the next.
+const NEXT_SEED: u32 = 10;
+
+/// Adjusts the poses of a calibration.
+///
+/// # Errors
+/// Device errors, and errors of `observe`.
+pub(super) fn adjust(task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result<Option<Adjusted>> {
+    let AdjustTask { gpu, config, dataset, calibration } = *task;
+    let wanted = config.calibrate.adjust == AdjustMode::Auto && config.calibrate.mode == CalibrateMode::Auto;
+    // Displacements of the heart that are stated were measured: they are not to be corrected.
+    if !wanted || dataset.heart_shifts() {
+        return Ok(None);
+    }
+    let coarse = coarsened_for_calibration(dataset);
+    let evidence: Vec<ViewEvidence> =
+        Series::of(&coarse).par_iter().map(|s| ViewEvidence::new(s).on_canvas(coarse.canvas())).collect();
+    let stands = Stands::new(&coarse, evidence.iter().map(|v| v.view).collect());
+    let start = stands.poses(calibration);
+    Adjuster { gpu, config, stands, evidence }.run(start, observe)
+}
+
+/// Pruning of components that the images do not support. Wrong poses take the support from ends of vessels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Pruning {
+    On,
+    Off,
+}
+
+struct Adjuster<'a> {
+    gpu: &'a Gpu,
+    config: &'a Config,
+    stands: Stands<'a>,
+    evidence: Vec<ViewEvidence>,
+}
+
+impl Adjuster<'_> {
+    fn run(&self, start: Poses, observe: &mut Observe<'_>) -> Result<Option<Adjusted>> {
+        observe(0.0)?;
+        let Some(before) = self.misfit(&start)? else { return Ok(None) };
+        let outcome = |poses: Poses, after: Option<f64>| {
+            let accepted = after.is_some_and(|after| after <= ACCEPTED * before);
+            let record = Adjustment { accepted, misfit_before: before, misfit_after: after };
+            Ok(Some(Adjusted { views: self.stands.views.clone(), poses, record }))
+        };
+        if before <= SMALL_MISFIT || before >= LARGE_MISFIT {
+            return outcome(start, None);
+        }
+        let Some(poses) = self.found(start, observe)? else { return Ok(None) };
+        let after = self.misfit(&poses)?;
+        outcome(poses, after)
+    }
+
+    /// Finds poses in cycles of a fit and a step of the poses.
+    fn found(&self, start: Poses, observe: &mut Observe<'_>) -> Result<Option<Poses>> {
+        let n_cycles: u32 = STAGES.iter().map(|stage| stage.cycles).sum();
+        let (mut poses, mut number) = (start, 0);
+        for stage in &STAGES {
+            let end = number + stage.cycles;
+            while number < end {
+                number += 1;
+                // The fits before and after the cycles count as well.
+                observe(f64::from(number) / f64::from(n_cycles + 2))?;
+                let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
+                let config = stage.config(self.config, seed);
+                let Some(trainer) = self.fit(&poses, &config, Pruning::Off)? else { return Ok(None) };
+                let mut next = poses.clone();
+                let mut field = FieldInLoop::new(&trainer, &self.stands);
+                for _ in 0..STEPS {
+                    next = field.step(&next)?;
+                }
+                let change_px = self.stands.change_px(trainer.targets(), &poses, &next);
+                tracing::debug!("cycle {number} of the adjustment: {} Gaussians, {change_px:.3} px", trainer.count());
+                poses = extrapolated(&poses, &next, if number < n_cycles { FARTHER } else { 1.0 });
+                if change_px < SETTLED_PX {
+                    break;
+                }
+            }
+            number = end;
+        }
+        observe(f64::from(n_cycles + 1) / f64::from(n_cycles + 2))?;
+        Ok(Some(poses))
+    }
+
+    /// Misfit of a fit with the settings of the run.
+    fn misfit(&self, poses: &Poses) -> Result<Option<f64>> {
+        let Some(trainer) = self.fit(poses, self.config, Pruning::On)? else { return Ok(None) };
+        Ok(Some(misfit(trainer.targets(), &trainer.images()?)))
+    }
+
+    /// Fits a deformable set at poses; none where the data do not ask for one.
+    fn fit(&self, poses: &Poses, config: &Config, pruning: Pruning) -> Result<Option<DeformableTrainer>> {
+        let dataset = self.stands.at(poses);
+        let half = dynamic_half(config, &dataset);
+        let motion = SoftMotion::carved(self.evidence.clone(), &dataset, half, SOFT_HULL_CELLS);
+        let targets = match Targets::new(&dataset, &motion, &config.gaussians) {
+            // The plan of the run tells what is missing.
+            Err(Error::Config { .. }) => return Ok(None),
+            targets => targets?,
+        };
+        if targets.form(config.gaussians.form) != GaussianForm::Deformable {
+            return Ok(None);
+        }
+        let mut trainer = DeformableTrainer::new(self.gpu, targets, config)?;
+        if pruning == Pruning::Off {
+            trainer.keep_unsupported();
+        }
+        while trainer.step() < config.gaussians.iterations {
+            trainer.advance(config.gaussians.iterations)?;
+        }
+        Ok(Some(trainer))
+    }
+}
+
+impl Stage {
+    /// Settings of a fit that cannot absorb errors of the poses.
+    fn config(&self, config: &Config, seed: u32) -> Config {
+        let mut stiff = config.clone();
+        stiff.seed = seed;
+        (stiff.deformable.own_rate, stiff.deformable.smoothness) = (0.0, SMOOTHNESS);
+        let gaussians = &mut stiff.gaussians;
+        (gaussians.grow_share, gaussians.min_scale, gaussians.count) = (0.0, self.min_scale, self.count);
+        stiff
+    }
+}
+
+/// Returns poses that have moved `factor` times as far; contrasts are taken as they are.
+fn extrapolated(from: &Poses, to: &Poses, factor: f64) -> Poses {
+    let view = |(from, to): (&ViewPose, &ViewPose)| ViewPose {
+        angles_deg: [0, 1].map(|k| from.angles_deg[k] + factor * (to.angles_deg[k] - from.angles_deg[k])),
+        shift: from.shift + factor * (to.shift - from.shift),
+    };
+    let heart = from.heart.iter().zip(&to.heart);
+    Poses {
+        views: from.views.iter().zip(&to.views).map(view).collect(),
+        heart: heart.map(|(a, b)| a.iter().zip(b).map(|(a, b)| *a + factor * (*b - *a)).collect()).collect(),
+        gains: to.gains.clone(),
+    }
+}

@@ -1,0 +1,211 @@
+//! Adjustment of views with the field of a fit in the loop: columns against f64 twins, planted errors of poses, whole adjustments.
+
+use crate::common::gpu;
+use crate::disagreeing::{PHASES, Shot, Studio, Wrong};
+use glam::DVec3;
+use nertca_vk::calibrate::correction::Calibration;
+use nertca_vk::calibrate::pose::Poses;
+use nertca_vk::calibrate::{adjusted, calibrate};
+use nertca_vk::config::{Config, Preset};
+use nertca_vk::fields::scale::dynamic_half;
+use nertca_vk::fitting::fit::AdjustTask;
+use nertca_vk::gaussians::field::DeformableGaussians;
+use nertca_vk::gaussians::view::SplatView;
+use nertca_vk::geometry::MM_PER_UNIT;
+use nertca_vk::gpu::device::Gpu;
+use nertca_vk::methods;
+use nertca_vk::methods::dynamic_gaussians::adjust::poses::Stands;
+use nertca_vk::methods::dynamic_gaussians::adjust::residual::misfit;
+use nertca_vk::methods::dynamic_gaussians::adjust::step::FieldInLoop;
+use nertca_vk::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use nertca_vk::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
+use nertca_vk::methods::dynamic_gaussians::targets::Targets;
+use nertca_vk::reference::gaussians::{params, project};
+use nertca_vk::scan::dataset::Dataset;
+
+const SIZE: usize = 64;
+
+fn fast() -> Config {
+    Config::preset(Preset::Fast)
+}
+
+/// A short fit to the stated geometry of a dataset.
+fn fitted(gpu: &Gpu, dataset: &Dataset) -> DeformableTrainer {
+    let mut config = fast();
+    config.gaussians.iterations = 60;
+    // As broad as where poses are adjusted.
+    config.gaussians.min_scale = 1.2;
+    // Where a Gaussian is cut off, its image has no derivative.
+    config.gaussians.cut = 5.0;
+    let motion = SoftMotion::new(dataset, dynamic_half(&config, dataset), 96);
+    let targets = Targets::new(dataset, &motion, &config.gaussians).unwrap();
+    let mut trainer = DeformableTrainer::new(gpu, targets, &config).unwrap();
+    while trainer.step() < config.gaussians.iterations {
+        trainer.advance(config.gaussians.iterations).unwrap();
+    }
+    trainer
+}
+
+/// Errors of poses of about a pixel, with displacements and contrasts that differ from frame to frame.
+fn wrong_poses(n_views: usize) -> Poses {
+    let mut poses = Poses::stated(n_views, PHASES as usize);
+    let wave = |k: usize| (1.7 * k as f64 + 0.4).sin();
+    for (v, pose) in poses.views.iter_mut().enumerate() {
+        pose.angles_deg = [0.2 * wave(v), -0.2 * wave(v + 5)];
+        pose.shift = DVec3::new(wave(v), wave(v + 3), wave(v + 7)) * 0.4 / MM_PER_UNIT;
+        for t in 0..PHASES as usize {
+            poses.heart[v][t] = DVec3::new(wave(t), wave(t + v), wave(t + 4)) * 0.2 / MM_PER_UNIT;
+        }
+        // Opposite excesses of contrast: their mean is that of the field.
+        (0..PHASES as usize).for_each(|t| poses.gains[v][t] = if (t + v) % 2 == 0 { 0.15 } else { -0.15 });
+    }
+    poses
+}
+
+/// Images of a field in f64, `[image][pixel]`.
+fn twin(field: &DeformableGaussians, targets: &Targets, views: &[SplatView]) -> Vec<f64> {
+    let mut images = vec![0.0; targets.n_images * targets.n_pixels()];
+    for (at, image) in targets.image_of.iter().enumerate() {
+        let Some(image) = *image else { continue };
+        let view = &views[image];
+        let pixels = &mut images[image * targets.n_pixels()..][..targets.n_pixels()];
+        for g in field.at((at / targets.n_views) as f64 + view.after_phase) {
+            if let Some(projection) = project(&params(&g), view, &field.rest.setup) {
+                projection.splat(&field.rest.setup, pixels);
+            }
+        }
+    }
+    images
+}
+
+fn norm(values: impl Iterator<Item = f64>) -> f64 {
+    values.map(|v| v * v).sum::<f64>().sqrt()
+}
+
+#[test]
+fn columns_are_derivatives_of_the_twin() {
+    let gpu = gpu();
+    let dataset = Studio::new(&gpu, SIZE, 1).shoot(3, false, Wrong::default()).dataset;
+    let trainer = fitted(&gpu, &dataset);
+    let stands = Stands::new(&dataset, vec![0, 1, 2]);
+    let field = FieldInLoop::new(&trainer, &stands);
+    let deformable = trainer.deformable().unwrap();
+    let poses = wrong_poses(3);
+    let images = |poses: &Poses| twin(&deformable, &field.targets, &stands.seen(&field.targets, poses));
+    let drawn = field.drawn(&poses).unwrap();
+    let expected = images(&poses);
+    let apart = norm(drawn.iter().zip(&expected).map(|(a, b)| f64::from(*a) - b)) / norm(expected.iter().copied());
+    assert!(apart < 1e-3, "images differ by {apart}");
+    for (unknown, column) in field.columns(&poses).unwrap().iter().enumerate() {
+        let step = if unknown < 2 { 1e-3 } else { 1e-5 };
+        let moved = |step: f64| {
+            let mut moved = poses.clone();
+            for pose in &mut moved.views {
+                match unknown.checked_sub(2) {
+                    None => pose.angles_deg[unknown] += step,
+                    Some(axis) => pose.shift[axis] += step,
+                }
+            }
+            images(&moved)
+        };
+        let (ahead, behind) = (moved(step), moved(-step));
+        let slope: Vec<f64> = ahead.iter().zip(&behind).map(|(a, b)| (a - b) / (2.0 * step)).collect();
+        let apart = norm(column.iter().zip(&slope).map(|(a, b)| f64::from(*a) - b)) / norm(slope.iter().copied());
+        println!("unknown {unknown}: {apart:.4}");
+        assert!(apart < 0.05, "the derivatives by unknown {unknown} differ by {apart}");
+    }
+}
+
+#[test]
+fn planted_errors_of_poses_and_contrasts_are_found() {
+    let gpu = gpu();
+    let dataset = Studio::new(&gpu, SIZE, 1).shoot(3, false, Wrong::default()).dataset;
+    let trainer = fitted(&gpu, &dataset);
+    let stands = Stands::new(&dataset, vec![0, 1, 2]);
+    let mut field = FieldInLoop::new(&trainer, &stands);
+    let truth = wrong_poses(3);
+    // Images that show the field at the true poses, in front of a flat background.
+    let drawn = field.drawn(&truth).unwrap();
+    field.set_contrasts(&truth);
+    let pixels = field.targets.n_pixels();
+    field.targets.images =
+        drawn.iter().enumerate().map(|(p, d)| 2.0 + field.targets.contrast[p / pixels] * d).collect();
+    field.targets.noise.fill(0.0);
+    field.targets.weight.fill(1.0);
+    let distance = |poses: &Poses| {
+        let (a, b) = (stands.seen(&field.targets, poses), stands.seen(&field.targets, &truth));
+        let points = [DVec3::ZERO, DVec3::X * 10.0, DVec3::Y * 10.0, DVec3::Z * 10.0];
+        let of = |(a, b): (&SplatView, &SplatView)| {
+            points.map(|p| (a.project(p).1 - b.project(p).1).hypot(a.project(p).2 - b.project(p).2))
+        };
+        let all: Vec<f64> = a.iter().zip(&b).flat_map(of).collect();
+        (norm(all.iter().copied()).powi(2) / all.len() as f64).sqrt()
+    };
+    let contrast = |poses: &Poses| {
+        let apart = poses.gains.iter().flatten().zip(truth.gains.iter().flatten()).map(|(a, b)| (a - b).abs());
+        apart.fold(0.0, f64::max)
+    };
+    let stated = Poses::stated(3, PHASES as usize);
+    let (before, misfit_at) = (distance(&stated), |field: &FieldInLoop<'_>, poses: &Poses| {
+        misfit(&field.targets, &field.drawn(poses).unwrap())
+    });
+    let mut poses = stated.clone();
+    let mut stepping = FieldInLoop::new(&trainer, &stands);
+    stepping.targets = field.targets.clone();
+    stepping.set_contrasts(&poses);
+    let misfit_before = misfit_at(&stepping, &poses);
+    for _ in 0..16 {
+        poses = stepping.step(&poses).unwrap();
+        println!("{:.3} px, contrast {:.3}", distance(&poses), contrast(&poses));
+    }
+    stepping.set_contrasts(&poses);
+    let (after, misfit_after) = (distance(&poses), misfit_at(&stepping, &poses));
+    println!(
+        "{before:.3} px to {after:.3} px, contrast {:.4}, misfit {misfit_before:.4} to {misfit_after:.4}",
+        contrast(&poses)
+    );
+    assert!(before > 0.5 && after < 0.1 * before, "{before} px to {after} px");
+    assert!(contrast(&poses) < 0.03, "contrasts differ by {}", contrast(&poses));
+    assert!(misfit_after < 0.1 * misfit_before, "misfit {misfit_before} to {misfit_after}");
+}
+
+fn error_px(shot: &Shot, dataset: &Dataset) -> f64 {
+    shot.error_px(&|view, phase| dataset.heart_rays_at(view, phase as u32))
+}
+
+/// Adjusts the views of a shot, starting from a calibration.
+fn adjust(gpu: &Gpu, shot: &Shot, calibration: &Calibration) -> Calibration {
+    let config = fast();
+    let task = AdjustTask { gpu, config: &config, dataset: &shot.dataset, calibration };
+    let outcome = methods::of(&config).adjust(&task, &mut |_| Ok(())).unwrap().unwrap();
+    let after = adjusted(&shot.dataset, calibration.clone(), outcome).unwrap();
+    println!("{}", after.notes.join("; "));
+    after
+}
+
+#[test]
+#[ignore = "long: tools/test --all"]
+fn an_adjustment_brings_views_together() {
+    let gpu = gpu();
+    let wrong = Wrong { angle_deg: 0.2, shift_mm: 0.3, breathing_mm: 0.6, noise: 0.02, seed: 11 };
+    let shot = Studio::new(&gpu, 100, 1).shoot(3, false, wrong);
+    let after = adjust(&gpu, &shot, &Calibration::none(None));
+    let record = after.adjustment.clone().unwrap();
+    let (before, after) = (error_px(&shot, &shot.dataset), error_px(&shot, &shot.dataset.corrected(&after).unwrap()));
+    println!("{before:.3} px to {after:.3} px, {record:?}");
+    assert!(record.accepted && before > 0.5 && after < 0.5 * before, "{before} px to {after} px, {record:?}");
+}
+
+#[test]
+fn views_that_agree_are_not_adjusted() {
+    let gpu = gpu();
+    let shot = Studio::new(&gpu, 100, 1).shoot(4, false, Wrong { seed: 11, ..Wrong::default() });
+    let calibration = calibrate(&shot.dataset, &fast()).unwrap();
+    let after = adjust(&gpu, &shot, &calibration);
+    let record = after.adjustment.clone().unwrap();
+    println!("{record:?}");
+    assert!(!record.accepted, "{record:?}");
+    let (before, after) = (shot.dataset.corrected(&calibration).unwrap(), shot.dataset.corrected(&after).unwrap());
+    assert!(before.frames.iter().zip(&after.frames).all(|(a, b)| a.contrast == b.contrast));
+    assert_eq!(error_px(&shot, &before), error_px(&shot, &after));
+}
