@@ -3,6 +3,7 @@
 use crate::calibrate::calibrate;
 use crate::calibrate::correction::Calibration;
 use crate::checkpoint::Checkpoint;
+use crate::config::{AdjustMode, CalibrateMode};
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::gpu::pipeline::KeptPipelines;
@@ -348,6 +349,9 @@ impl Shared {
         dataset.notes.iter().for_each(|note| tracing::info!("{note}"));
         let calibration = calibrate(&dataset, &config)?;
         calibration.notes.iter().for_each(|note| tracing::info!("{note}"));
+        if config.calibrate.adjust == AdjustMode::Auto && config.calibrate.mode == CalibrateMode::Auto {
+            tracing::info!("sessions calibrate views without the adjustment that `nertca-vk train` makes");
+        }
         let dataset = dataset.corrected(&calibration)?;
         let fresh = Plan::new(&config, &dataset)?;
         let mut earlier = None;

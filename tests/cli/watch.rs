@@ -176,7 +176,10 @@ fn runs_are_taken_in_as_they_come() {
     std::fs::write(at("phases.txt"), list).unwrap();
     let (frames, phases, phase_list) = (format!("1-{PHASES}"), PHASES.to_string(), at("phases.txt"));
     let reading = ["--phases", &phases, "--frames", &frames, "--phase-list", text(&phase_list)];
-    let short = ["--set", "train.iterations=40", "--set", "gaussians.iterations=30"];
+    // A session does not adjust its views.
+    let short = ["train.iterations=40", "gaussians.iterations=30", "calibrate.adjust=off"]
+        .map(|setting| ["--set", setting])
+        .concat();
     let (inbox, run) = (at("inbox"), at("run"));
     let mut watcher =
         Watcher::new(&[&[text(&inbox), "-o", text(&run), "--until-idle", "4"], &reading[..], &short[..]].concat());
