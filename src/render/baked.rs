@@ -152,7 +152,7 @@ impl Baked {
 
     /// Fills the volume of a single field with cells that [`Baked::cells`] returned. The copy may still be under way, as after
     /// [`Baked::bake`]. No picture may be under way. Pictures show kept images of the earlier static field until
-    /// [`Baked::redraw_static_images`].
+    /// [`crate::render::live::Live`] has drawn them anew.
     ///
     /// # Errors
     /// [`Error::OutOfMemory`]; other device errors.
