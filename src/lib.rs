@@ -163,6 +163,7 @@ pub mod gaussians {
     pub mod blobs;
     pub mod comparison;
     pub mod field;
+    mod mean;
     pub mod particles;
     pub mod pictures;
     pub mod spacing;

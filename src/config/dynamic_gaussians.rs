@@ -8,6 +8,10 @@ use crate::config::{AdjustMode, Config, GaussianForm, Preset, nert_ca};
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
+fn one_fit() -> u32 {
+    1
+}
+
 section! {
     /// Gaussians as the dynamic field. Lengths are in pixels at the isocentre for images whose smaller side has 100 pixels, and
     /// scale with the image size; line integrals are shares of the views' strongest change.
@@ -65,6 +69,9 @@ section! {
         /// Interval, in iterations, at which the static background is estimated again from the images minus the Gaussians; not
         /// while rates fall; 0 = never.
         background_every: u32 in 0.0 to 1e6,
+        /// Number of fits with different seeds whose mean is the dynamic field; 0 = three where images are noisy or views were adjusted,
+        /// else one; 1 is the default for older files without this setting.
+        #[serde(default = "one_fit")] fits: u32 in 0.0 to 9.0,
     }
 }
 
@@ -126,6 +133,7 @@ pub(super) fn gaussians() -> Gaussians {
         link: 4.0,
         missing: 0.03,
         background_every: 40,
+        fits: 1,
     }
 }
 
@@ -180,7 +188,7 @@ pub(super) fn fast() -> Config {
             ..mlp.dynamic
         },
         occupancy: Occupancy { enabled: false, ..mlp.occupancy },
-        gaussians: Gaussians { form: GaussianForm::Auto, ..mlp.gaussians },
+        gaussians: Gaussians { form: GaussianForm::Auto, fits: 0, ..mlp.gaussians },
         ..mlp
     }
 }
@@ -203,6 +211,7 @@ impl MethodSettings for Settings {
 
     fn is_key(&self, _: Preset, key: &str) -> bool {
         TENSOR_KEYS.contains(&key)
-            || ["calibrate.adjust", "gaussians.form", "gaussians.iterations", "gaussians.count"].contains(&key)
+            || ["calibrate.adjust", "gaussians.form", "gaussians.iterations", "gaussians.count", "gaussians.fits"]
+                .contains(&key)
     }
 }

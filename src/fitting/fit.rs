@@ -49,7 +49,7 @@ pub trait Method: Sync {
     ///
     /// # Errors
     /// Device errors, and errors of `observe`.
-    fn adjust(&self, _task: &AdjustTask<'_>, _observe: &mut Observe<'_>) -> Result<Option<Adjusted>> {
+    fn adjust(&self, _task: &AdjustTask<'_>, _observe: &mut Observe<'_>) -> Result<Option<AdjustedFit>> {
         Ok(None)
     }
 
@@ -85,6 +85,26 @@ pub struct AdjustTask<'a> {
     pub dataset: &'a Dataset,
     /// Calibration of its views.
     pub calibration: &'a Calibration,
+}
+
+/// Outcome of an adjustment.
+#[derive(Debug, Clone)]
+pub struct AdjustedFit {
+    /// Poses after it, and its record.
+    pub adjusted: Adjusted,
+    /// Fit to the views as they are after the adjustment; none where it was made with coarser images.
+    pub made: Option<MadeGaussians>,
+}
+
+/// A fit of Gaussians that is done before its run begins.
+#[derive(Debug, Clone)]
+pub struct MadeGaussians {
+    /// The field after all iterations.
+    pub gaussians: DynamicGaussians,
+    /// Loss of each iteration.
+    pub losses: Vec<f64>,
+    /// Fingerprint of the data and the settings of the fit.
+    pub fingerprint: String,
 }
 
 /// Receives the share of a work that is done; an error ends the work.
@@ -190,6 +210,8 @@ pub trait FitState: Debug + Send + Sync {
 pub enum Beginning<'a> {
     /// The fit begins from scratch.
     Scratch,
+    /// The fit begins from scratch; a fit of Gaussians that was made before need not be repeated where it is the same.
+    Made(&'a MadeGaussians),
     /// The fit continues a fit to the same data; the result is that of an uninterrupted one.
     Resumed(&'a SavedFit),
     /// The fit goes on from a fit to other data, as far as the method can.

@@ -52,6 +52,8 @@ pub struct Gaussians {
     /// Intensities of Gaussians of which nearer ones hide those behind them, as with X-Gaussian; none where line integrals add
     /// up.
     pub intensities: Option<Vec<f32>>,
+    /// Share of the attenuation of one fit that lies in vessels of another, where the field is the mean of several fits.
+    pub agreement: Option<f64>,
 }
 
 impl Gaussians {
@@ -100,7 +102,7 @@ const BELOW_VESSELS: f64 = 0.75;
 
 /// Returns the density of the vessels: three quarters of the attenuation are in less dense Gaussians, such as the ends, the
 /// walls and the thin branches of vessels, and other moving structures.
-fn vessel_density(rows: &[Gaussian], setup: &GaussianSetup) -> f64 {
+pub(super) fn vessel_density(rows: &[Gaussian], setup: &GaussianSetup) -> f64 {
     let mut by_density: Vec<(f64, f64)> = rows.iter().map(|g| (density(g), mass(g, setup))).collect();
     by_density.sort_by(|a, b| a.0.total_cmp(&b.0));
     let all: f64 = by_density.iter().map(|(_, mass)| mass).sum();

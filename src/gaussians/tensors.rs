@@ -43,6 +43,9 @@ pub(crate) struct GaussianHeader {
     /// Whether nearer Gaussians hide those behind them, so that each has an intensity.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     blended: bool,
+    /// Share of the attenuation of one fit that lies in vessels of another; none for a single fit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    agreement: Option<f64>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -73,6 +76,7 @@ pub(crate) fn header(field: &DynamicGaussians) -> GaussianHeader {
         views: sets.setup.n_views,
         crowd: sets.is_crowd,
         blended: sets.intensities.is_some(),
+        agreement: sets.agreement,
         grid: match field {
             DynamicGaussians::PerPhase(_) => None,
             DynamicGaussians::Deformable(deformable) => Some(GridHeader {
@@ -184,6 +188,7 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
         step: header.step,
         is_crowd: header.crowd,
         intensities: header.blended.then(|| file.floats(INTENSITY, &[Some(n)])).transpose()?,
+        agreement: header.agreement,
     };
     let Some(grid) = &header.grid else { return Ok(DynamicGaussians::PerPhase(sets)) };
     if !(2..=MAX_NODES).contains(&grid.nodes)

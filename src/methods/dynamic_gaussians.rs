@@ -9,9 +9,11 @@ pub mod deformable;
 pub(crate) mod fine;
 pub mod fit;
 pub mod lengths;
+mod made;
 pub mod per_phase;
 mod pruning;
 pub mod remainder;
+mod repeated;
 pub mod seeds;
 #[cfg(feature = "diagnostics")]
 pub mod selftest;
@@ -27,7 +29,6 @@ mod test_targets;
 pub mod trainer;
 pub mod twin;
 
-use crate::calibrate::adjustment::Adjusted;
 use crate::config::method::MethodKind;
 use crate::config::sections::Deformable;
 use crate::config::{Config, GaussianForm};
@@ -35,7 +36,7 @@ use crate::error::Result;
 use crate::fields::data::lower_rates;
 use crate::fields::state;
 use crate::fitting::fit::{
-    AdjustTask, Fit, FitData, FitStart, Method, Observe, PlannedFit, SavedAt, SavedFit, TimedFit,
+    AdjustTask, AdjustedFit, Fit, FitData, FitStart, Method, Observe, PlannedFit, SavedAt, SavedFit, TimedFit,
 };
 use crate::gaussians::blobs::BlobKernels;
 use crate::gaussians::field::SMALLER_STEPS;
@@ -71,7 +72,7 @@ impl Method for DynamicGaussiansMethod {
         Ok(PlannedFit { scene: data.fields.scene.clone(), data: Box::new(data) })
     }
 
-    fn adjust(&self, task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result<Option<Adjusted>> {
+    fn adjust(&self, task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result<Option<AdjustedFit>> {
         adjust::adjust(task, observe)
     }
 

@@ -86,6 +86,7 @@ mod tests {
                 rows: (0..4).map(row).collect(),
                 step: 9,
                 is_crowd: false,
+                agreement: None,
                 intensities: None,
             },
             setup,

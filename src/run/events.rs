@@ -119,6 +119,10 @@ pub enum Event {
     },
     /// The run reached its end or the requested stop.
     Finished {
+        /// Share of the attenuation of one fit of Gaussians that lies in vessels of another, where the dynamic field is the mean of
+        /// several fits.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        agreement: Option<f64>,
         /// Iterations done.
         step: u32,
         /// Seconds spent training, validation excluded.

@@ -12,7 +12,7 @@ use crate::checkpoint::{self, Checkpoint};
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::files;
-use crate::fitting::fit::AdjustTask;
+use crate::fitting::fit::{AdjustTask, MadeGaussians};
 use crate::fitting::losses::LargeLoss;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
@@ -74,7 +74,7 @@ pub fn reconstruct(
         files::write_atomic(&options.run.join(CONFIG), config.to_toml()?.as_bytes())?;
     }
     let checked = if options.resume { None } else { checked(dataset) };
-    let Calibrated { dataset, carried, calibration } = calibrated(gpu, config, dataset, options, observe)?;
+    let Calibrated { dataset, carried, calibration, made } = calibrated(gpu, config, dataset, options, observe)?;
     let dataset = &dataset;
     let trainer = if options.resume {
         let saved = Checkpoint::read(&checkpoint::newest(options.run)?)?;
@@ -86,7 +86,7 @@ pub fn reconstruct(
         if let Some(hull) = &plan.hull {
             hull_pictures::write(&options.run.join("report"), dataset, hull)?;
         }
-        Trainer::new(gpu, plan, dataset, options.tuning.clone())?
+        Trainer::after_adjustment(gpu, plan, dataset, options.tuning.clone(), made.as_ref())?
     };
     let config = trainer.plan().config.clone();
     files::write_atomic(&options.run.join(CONFIG), config.to_toml()?.as_bytes())?;
@@ -150,6 +150,8 @@ struct Calibrated {
     /// Rigid motion of the reconstruction against the truth, where that is known.
     carried: Option<RigidMotion>,
     calibration: Calibration,
+    /// Fit of Gaussians that the adjustment of views has left.
+    made: Option<MadeGaussians>,
 }
 
 /// Returns the dataset with the geometry of the run: calibrated now, or when the run was begun.
@@ -160,6 +162,7 @@ fn calibrated(
     options: &RunOptions<'_>,
     observe: &mut dyn FnMut(&Event),
 ) -> Result<Calibrated> {
+    let mut made = None;
     let calibration = if options.resume {
         Calibration::read(options.run)?.unwrap_or_else(|| Calibration::none(None))
     } else {
@@ -173,7 +176,8 @@ fn calibrated(
             }
         };
         if let Some(outcome) = methods::of(config).adjust(&task, &mut observe)? {
-            calibration = adjusted(dataset, calibration, outcome)?;
+            calibration = adjusted(dataset, calibration, outcome.adjusted)?;
+            made = outcome.made;
         }
         calibration.write(options.run)?;
         calibration
@@ -183,7 +187,7 @@ fn calibrated(
         silhouette_pictures::write(&options.run.join("report"), dataset, &corrected)?;
     }
     let carried = carried_by(&corrected)?;
-    Ok(Calibrated { dataset: in_calibrated_frame(&corrected)?.unwrap_or(corrected), carried, calibration })
+    Ok(Calibrated { dataset: in_calibrated_frame(&corrected)?.unwrap_or(corrected), carried, calibration, made })
 }
 
 /// Runs the iterations. Snapshots go to the worker, which works beside training where `tuning.overlap` says so, and
@@ -262,7 +266,8 @@ impl<'a> Loop<'a> {
         let (step, elapsed_s) = (self.training.trainer().step(), self.training.elapsed_s());
         (self.tell)(Event::Profile { step, passes: self.training.trainer_mut().profile_step()? })?;
         let (train_s, dynamic_share) = (self.training.train_s(), self.dynamic_share);
-        (self.tell)(Event::Finished { step, train_s, elapsed_s, dynamic_share })
+        let agreement = self.training.trainer().outline().gaussians.and_then(|field| field.rows().agreement);
+        (self.tell)(Event::Finished { agreement, step, train_s, elapsed_s, dynamic_share })
     }
 
     fn cancelled(&self) -> bool {

@@ -271,6 +271,7 @@ fn drawn_set(n: usize, n_phases: u32) -> Gaussians {
         rows: rows.collect(),
         step: 7,
         is_crowd: false,
+        agreement: None,
         intensities: None,
     }
 }

@@ -332,7 +332,7 @@ impl Shared {
             return Ok(());
         }
         let started = Instant::now();
-        let ((dataset, taken), config, left_out) = {
+        let ((dataset, taken), mut config, left_out) = {
             let inbox = lock(&self.inbox);
             let left_out = inbox.leaves_out().then(|| inbox.why_left_out());
             (inbox.training_dataset()?, inbox.options.config.clone(), left_out)
@@ -351,6 +351,10 @@ impl Shared {
         calibration.notes.iter().for_each(|note| tracing::info!("{note}"));
         if config.calibrate.adjust == AdjustMode::Auto && config.calibrate.mode == CalibrateMode::Auto {
             tracing::info!("sessions calibrate views without the adjustment that `nertca-vk train` makes");
+        }
+        if config.gaussians.fits == 0 {
+            // Pictures are wanted while frames arrive, and a mean of fits cannot go on with new ones.
+            config.gaussians.fits = 1;
         }
         let dataset = dataset.corrected(&calibration)?;
         let fresh = Plan::new(&config, &dataset)?;

@@ -4,7 +4,7 @@ use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::fields::trainer::FieldsFit;
 use crate::fingerprint::Fingerprint;
-use crate::fitting::fit::{Beginning, FieldFeed, Fit, FitField, FitStart};
+use crate::fitting::fit::{Beginning, FieldFeed, Fit, FitField, FitStart, MadeGaussians};
 use crate::fitting::ledger::Ledger;
 use crate::fitting::losses::{LargeLoss, LossWatch, StepLoss};
 use crate::gaussians::field::DynamicGaussians;
@@ -77,6 +77,20 @@ impl Trainer {
     /// all.
     pub fn new(gpu: &Gpu, plan: Plan, dataset: &Dataset, tuning: Tuning) -> Result<Trainer> {
         Self::start(gpu, plan, dataset, tuning, Beginning::Scratch)
+    }
+
+    /// Starts a run from scratch, with a fit of Gaussians that was made while its views were adjusted.
+    ///
+    /// # Errors
+    /// Errors of [`Trainer::new`].
+    pub fn after_adjustment(
+        gpu: &Gpu,
+        plan: Plan,
+        dataset: &Dataset,
+        tuning: Tuning,
+        made: Option<&MadeGaussians>,
+    ) -> Result<Trainer> {
+        Self::start(gpu, plan, dataset, tuning, made.map_or(Beginning::Scratch, Beginning::Made))
     }
 
     /// Starts a run from scratch but for its Gaussians, which go on from those that were fitted to `earlier` data as in

@@ -88,6 +88,7 @@ mod tests {
                 rows: vec![gaussian(-15.0), gaussian(15.0)],
                 step: 1,
                 is_crowd: false,
+                agreement: None,
                 intensities: None,
             },
             setup: DeformableSetup {

@@ -84,6 +84,7 @@ fn tree() -> DeformableGaussians {
             rows: (0..6).map(gaussian).collect(),
             step: 1,
             is_crowd: false,
+            agreement: None,
             intensities: None,
         },
         setup: DeformableSetup {

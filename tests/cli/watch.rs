@@ -176,8 +176,8 @@ fn runs_are_taken_in_as_they_come() {
     std::fs::write(at("phases.txt"), list).unwrap();
     let (frames, phases, phase_list) = (format!("1-{PHASES}"), PHASES.to_string(), at("phases.txt"));
     let reading = ["--phases", &phases, "--frames", &frames, "--phase-list", text(&phase_list)];
-    // A session does not adjust its views.
-    let short = ["train.iterations=40", "gaussians.iterations=30", "calibrate.adjust=off"]
+    // A session does not adjust its views, and makes a single fit.
+    let short = ["train.iterations=40", "gaussians.iterations=30", "calibrate.adjust=off", "gaussians.fits=1"]
         .map(|setting| ["--set", setting])
         .concat();
     let (inbox, run) = (at("inbox"), at("run"));

@@ -1,6 +1,6 @@
 //! Adjustment of views with the field of a fit in the loop: columns against f64 twins, planted errors of poses, whole adjustments.
 
-use crate::common::gpu;
+use crate::common::{gpu, run, tuning};
 use crate::disagreeing::{PHASES, Shot, Studio, Wrong};
 use glam::DVec3;
 use nertca_vk::calibrate::correction::Calibration;
@@ -8,7 +8,7 @@ use nertca_vk::calibrate::pose::Poses;
 use nertca_vk::calibrate::{adjusted, calibrate};
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::fields::scale::dynamic_half;
-use nertca_vk::fitting::fit::AdjustTask;
+use nertca_vk::fitting::fit::{AdjustTask, MadeGaussians};
 use nertca_vk::gaussians::field::DeformableGaussians;
 use nertca_vk::gaussians::view::SplatView;
 use nertca_vk::geometry::MM_PER_UNIT;
@@ -20,8 +20,10 @@ use nertca_vk::methods::dynamic_gaussians::adjust::step::FieldInLoop;
 use nertca_vk::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use nertca_vk::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use nertca_vk::methods::dynamic_gaussians::targets::Targets;
+use nertca_vk::plan::Plan;
 use nertca_vk::reference::gaussians::{params, project};
 use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::train::trainer::Trainer;
 
 const SIZE: usize = 64;
 
@@ -173,14 +175,31 @@ fn error_px(shot: &Shot, dataset: &Dataset) -> f64 {
     shot.error_px(&|view, phase| dataset.heart_rays_at(view, phase as u32))
 }
 
-/// Adjusts the views of a shot, starting from a calibration.
-fn adjust(gpu: &Gpu, shot: &Shot, calibration: &Calibration) -> Calibration {
+/// Adjusts the views of a shot, starting from a calibration, and returns the calibration and the fit that the run takes over.
+fn adjust(gpu: &Gpu, shot: &Shot, calibration: &Calibration) -> (Calibration, MadeGaussians) {
     let config = fast();
     let task = AdjustTask { gpu, config: &config, dataset: &shot.dataset, calibration };
     let outcome = methods::of(&config).adjust(&task, &mut |_| Ok(())).unwrap().unwrap();
-    let after = adjusted(&shot.dataset, calibration.clone(), outcome).unwrap();
+    let after = adjusted(&shot.dataset, calibration.clone(), outcome.adjusted).unwrap();
     println!("{}", after.notes.join("; "));
-    after
+    (after, outcome.made.unwrap())
+}
+
+/// Trains to the end of the Gaussians with and without the fit that an adjustment has left, and checks that the results are the same.
+fn expect_taken_over(gpu: &Gpu, dataset: &Dataset, made: &MadeGaussians) {
+    let config = fast();
+    let plan = || Plan::new(&config, dataset).unwrap();
+    let mut with = Trainer::after_adjustment(gpu, plan(), dataset, tuning(gpu), Some(made)).unwrap();
+    let mut without = Trainer::new(gpu, plan(), dataset, tuning(gpu)).unwrap();
+    let end = config.gaussians.iterations;
+    assert!(without.preparation().is_some(), "a fit from scratch prepares its Gaussians");
+    // Where views were adjusted, other fits come first.
+    if dataset.frames.iter().all(|frame| frame.contrast == 1.0) {
+        assert_eq!(with.preparation(), None, "the fit is made already");
+    }
+    let losses = [run(&mut with, end), run(&mut without, end)];
+    assert_eq!(losses[0], losses[1]);
+    assert_eq!(with.model().unwrap().gaussians, without.model().unwrap().gaussians);
 }
 
 #[test]
@@ -189,9 +208,11 @@ fn an_adjustment_brings_views_together() {
     let gpu = gpu();
     let wrong = Wrong { angle_deg: 0.2, shift_mm: 0.3, breathing_mm: 0.6, noise: 0.02, seed: 11 };
     let shot = Studio::new(&gpu, 100, 1).shoot(3, false, wrong);
-    let after = adjust(&gpu, &shot, &Calibration::none(None));
+    let (after, made) = adjust(&gpu, &shot, &Calibration::none(None));
     let record = after.adjustment.clone().unwrap();
-    let (before, after) = (error_px(&shot, &shot.dataset), error_px(&shot, &shot.dataset.corrected(&after).unwrap()));
+    let corrected = shot.dataset.corrected(&after).unwrap();
+    expect_taken_over(&gpu, &corrected, &made);
+    let (before, after) = (error_px(&shot, &shot.dataset), error_px(&shot, &corrected));
     println!("{before:.3} px to {after:.3} px, {record:?}");
     assert!(record.accepted && before > 0.5 && after < 0.5 * before, "{before} px to {after} px, {record:?}");
 }
@@ -201,11 +222,16 @@ fn views_that_agree_are_not_adjusted() {
     let gpu = gpu();
     let shot = Studio::new(&gpu, 100, 1).shoot(4, false, Wrong { seed: 11, ..Wrong::default() });
     let calibration = calibrate(&shot.dataset, &fast()).unwrap();
-    let after = adjust(&gpu, &shot, &calibration);
+    let (after, made) = adjust(&gpu, &shot, &calibration);
     let record = after.adjustment.clone().unwrap();
     println!("{record:?}");
     assert!(!record.accepted, "{record:?}");
     let (before, after) = (shot.dataset.corrected(&calibration).unwrap(), shot.dataset.corrected(&after).unwrap());
     assert!(before.frames.iter().zip(&after.frames).all(|(a, b)| a.contrast == b.contrast));
     assert_eq!(error_px(&shot, &before), error_px(&shot, &after));
+    expect_taken_over(&gpu, &after, &made);
+    let other = MadeGaussians { fingerprint: "of other data".into(), ..made };
+    let plan = Plan::new(&fast(), &after).unwrap();
+    let trainer = Trainer::after_adjustment(&gpu, plan, &after, tuning(&gpu), Some(&other)).unwrap();
+    assert!(trainer.preparation().is_some(), "the fit to other data is not taken over");
 }

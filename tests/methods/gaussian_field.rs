@@ -4,7 +4,7 @@ use crate::common;
 use crate::common::{expect_agreement, expect_silence, gpu, phantom, run, tuning};
 use glam::DVec3;
 use nertca_vk::checkpoint::{self, Checkpoint};
-use nertca_vk::config::{Config, Preset, sections};
+use nertca_vk::config::{AdjustMode, Config, Preset, sections};
 use nertca_vk::error::Error;
 use nertca_vk::fields::state::FieldsState;
 use nertca_vk::gaussians::field::{DynamicGaussians, Gaussians};
@@ -151,10 +151,13 @@ fn resume_equals_no_interruption() {
     let gpu = gpu();
     let directory = tempfile::tempdir().unwrap();
     let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
-    for form in ["phase", "tree"] {
-        let config = short_run(form);
+    // With an adjustment of views, the fit is done before the run, and its iterations pass at once.
+    let (off, auto) = (AdjustMode::Off, AdjustMode::Auto);
+    for (form, fits, adjust) in [("phase", 1, off), ("tree", 1, off), ("tree", 2, off), ("tree", 1, auto)] {
+        let mut config = short_run(form);
+        (config.gaussians.fits, config.calibrate.adjust) = (fits, adjust);
         let go = |name: &str, resume: bool, stop: Option<&dyn Fn(&Event) -> bool>| {
-            let path = directory.path().join(format!("{form}-{name}"));
+            let path = directory.path().join(format!("{form}-{fits}-{adjust:?}-{name}"));
             let cancel = AtomicBool::new(false);
             let options = RunOptions { tuning: &tuning(&gpu), run: &path, resume, stop_at: None, cancel: &cancel };
             let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut |event| {
@@ -164,7 +167,7 @@ fn resume_equals_no_interruption() {
             });
             match (outcome, stop) {
                 (Ok(()), None) | (Err(Error::Interrupted), Some(_)) => {}
-                (outcome, _) => panic!("{outcome:?}"),
+                (outcome, _) => panic!("{form}, {fits} fits, {adjust:?}, {name}: {outcome:?}"),
             }
             std::fs::read(checkpoint::newest(&path).unwrap()).unwrap()
         };
@@ -176,7 +179,7 @@ fn resume_equals_no_interruption() {
         type Stop<'a> = (&'a str, &'a dyn Fn(&Event) -> bool);
         let mut stops: Vec<Stop<'_>> =
             vec![("while Gaussians are fitted", &first), ("while the still field is trained", &second)];
-        if form == "tree" {
+        if form == "tree" && adjust == off {
             stops.extend([("among the phases' own", &warming as &dyn Fn(&Event) -> bool), ("on the way", &tracking)]);
         }
         for (name, stop) in stops {
@@ -242,5 +245,40 @@ fn other_images_begin_the_fit_anew_and_keep_device_and_host_in_step() {
         gpu.download(&trainer.fit::<GaussiansFit>().unwrap().fields().forward().state, 0, 1).unwrap();
     assert_eq!(state[0].step, 32);
     drop(trainer);
+    expect_silence(gpu);
+}
+
+#[test]
+fn the_mean_of_fits_holds_all_of_them_and_their_agreement() {
+    let gpu = gpu();
+    let directory = tempfile::tempdir().unwrap();
+    let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+    let field = |form: &str, seed: u32, fits: u32| {
+        let mut config = short_run(form);
+        (config.seed, config.gaussians.fits, config.train.iterations) = (seed, fits, 21);
+        let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+        let losses = run(&mut trainer, 21);
+        assert_eq!(losses.len(), 21, "the iterations of the last fit, and one of the static field");
+        (losses, trainer.model().unwrap().gaussians.unwrap())
+    };
+    for form in ["phase", "tree"] {
+        let members = [field(form, 1001, 1), field(form, 1, 1)];
+        let (losses, mean) = field(form, 1, 2);
+        assert_eq!(losses[..20], members[1].0[..20], "the losses are those of the run's seed");
+        for phase in [0, 2] {
+            let want: Vec<_> = members.iter().flat_map(|(_, member)| member.at(phase)).collect();
+            let got = mean.at(phase);
+            assert_eq!(got.len(), want.len());
+            for (got, want) in got.iter().zip(&want) {
+                assert!((got.log_density - want.log_density - (2.0f32 / 3.0).ln()).abs() < 1e-5);
+                let apart = (0..3).map(|k| (got.position[k] - want.position[k]).abs()).fold(0.0, f32::max);
+                assert!(apart < 1e-3, "{form}, phase {phase}: {apart} pixels");
+            }
+        }
+        let agreement = mean.rows().agreement.unwrap();
+        println!("{form}: {agreement:.3}");
+        assert!(agreement > 0.3 && agreement < 1.0, "{agreement}");
+        assert_eq!(members[0].1.rows().agreement, None);
+    }
     expect_silence(gpu);
 }

@@ -436,6 +436,7 @@ fn maxima_are_those_of_the_field() {
         rows: random_gaussians(40, 2, 8.0, 6),
         step: 0,
         is_crowd: false,
+        agreement: None,
         intensities: None,
     };
     let view = &targets.views[1];

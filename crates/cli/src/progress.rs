@@ -99,9 +99,18 @@ pub fn show_progress() -> impl FnMut(&Event) {
         Event::Evaluation { .. } => evaluation(event),
         Event::Profile { .. } => (),
         Event::Saved { path, .. } => bar.set_message(format!("saved {}", path.display())),
-        Event::Finished { step, train_s, dynamic_share, .. } => {
+        Event::Finished { step, train_s, dynamic_share, agreement, .. } => {
             bar.finish_and_clear();
             say(&bar, format!("{step} iterations in {train_s:.1} s of training"));
+            if let Some(share) = agreement {
+                say(
+                    &bar,
+                    format!(
+                        "repeated fits agree: {:.0} % of the vessels of one lie in those of another",
+                        100.0 * share
+                    ),
+                );
+            }
             if let Some(share) = dynamic_share.filter(|share| *share > EXPLAINS_LITTLE) {
                 say(
                     &bar,

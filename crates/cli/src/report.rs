@@ -180,7 +180,12 @@ fn gaussians_of(field: &DynamicGaussians) -> String {
         DynamicGaussians::Deformable(_) => "one deformable set",
     };
     let kib = field.bytes() as f64 / 1024.0;
-    format!("{}, {form} (gaussians.form = \"{}\"), {kib:.0} KiB", field.rows().rows.len(), field.form().name())
+    let agreement = field.rows().agreement.map_or(String::new(), |share| {
+        let percent = 100.0 * share;
+        format!(", the mean of several fits; {percent:.0} % of the vessels of one fit lie in those of another")
+    });
+    let (n, name) = (field.rows().rows.len(), field.form().name());
+    format!("{n}, {form} (gaussians.form = \"{name}\"), {kib:.0} KiB{agreement}")
 }
 
 fn images_of(dataset: &Dataset) -> String {

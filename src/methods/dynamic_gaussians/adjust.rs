@@ -13,12 +13,15 @@ use crate::error::{Error, Result};
 use crate::evidence::ratios::ViewEvidence;
 use crate::evidence::series::Series;
 use crate::fields::scale::dynamic_half;
-use crate::fitting::fit::{AdjustTask, Observe};
+use crate::fitting::fit::{AdjustTask, AdjustedFit, MadeGaussians, Observe};
+use crate::gaussians::field::DynamicGaussians;
 use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::data::SOFT_HULL_CELLS;
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::made::fingerprint;
 use crate::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use crate::methods::dynamic_gaussians::targets::Targets;
+use crate::scan::dataset::Dataset;
 use poses::Stands;
 use rayon::prelude::*;
 use residual::misfit;
@@ -60,7 +63,7 @@ const NEXT_SEED: u32 = 10;
 ///
 /// # Errors
 /// Device errors, and errors of `observe`.
-pub(super) fn adjust(task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result<Option<Adjusted>> {
+pub(super) fn adjust(task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result<Option<AdjustedFit>> {
     let AdjustTask { gpu, config, dataset, calibration } = *task;
     let wanted = config.calibrate.adjust == AdjustMode::Auto && config.calibrate.mode == CalibrateMode::Auto;
     // Displacements of the heart that are stated were measured: they are not to be corrected.
@@ -72,7 +75,9 @@ pub(super) fn adjust(task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result
         Series::of(&coarse).par_iter().map(|s| ViewEvidence::new(s).on_canvas(coarse.canvas())).collect();
     let stands = Stands::new(&coarse, evidence.iter().map(|v| v.view).collect());
     let start = stands.poses(calibration);
-    Adjuster { gpu, config, stands, evidence }.run(start, observe)
+    let is_full_size = (coarse.width, coarse.height) == (dataset.width, dataset.height);
+    let calibrated = if is_full_size { coarse.corrected(calibration)? } else { stands.at(&start) };
+    Adjuster { gpu, config, stands, evidence, is_full_size }.run(&calibrated, start, observe)
 }
 
 /// Pruning of components that the images do not support. Wrong poses take the support from ends of vessels.
@@ -82,28 +87,40 @@ enum Pruning {
     Off,
 }
 
+/// A fit after all iterations.
+struct Fitted {
+    trainer: DeformableTrainer,
+    losses: Vec<f64>,
+    fingerprint: String,
+}
+
 struct Adjuster<'a> {
     gpu: &'a Gpu,
     config: &'a Config,
     stands: Stands<'a>,
     evidence: Vec<ViewEvidence>,
+    /// Whether the images are those of the run, so that a fit to them can be the run's.
+    is_full_size: bool,
 }
 
 impl Adjuster<'_> {
-    fn run(&self, start: Poses, observe: &mut Observe<'_>) -> Result<Option<Adjusted>> {
+    /// Adjusts the poses of a calibrated dataset.
+    fn run(&self, calibrated: &Dataset, start: Poses, observe: &mut Observe<'_>) -> Result<Option<AdjustedFit>> {
         observe(0.0)?;
-        let Some(before) = self.misfit(&start)? else { return Ok(None) };
-        let outcome = |poses: Poses, after: Option<f64>| {
-            let accepted = after.is_some_and(|after| after <= ACCEPTED * before);
+        let Some((before, made)) = self.compared(calibrated)? else { return Ok(None) };
+        let outcome = |poses: Poses, accepted: bool, after: Option<f64>, made: MadeGaussians| {
             let record = Adjustment { accepted, misfit_before: before, misfit_after: after };
-            Ok(Some(Adjusted { views: self.stands.views.clone(), poses, record }))
+            let adjusted = Adjusted { views: self.stands.views.clone(), poses, record };
+            Ok(Some(AdjustedFit { adjusted, made: Some(made) }))
         };
         if before <= SMALL_MISFIT || before >= LARGE_MISFIT {
-            return outcome(start, None);
+            return outcome(start, false, None, made);
         }
         let Some(poses) = self.found(start, observe)? else { return Ok(None) };
-        let after = self.misfit(&poses)?;
-        outcome(poses, after)
+        match self.compared(&self.as_in_a_run(&poses)?)? {
+            Some((after, adjusted)) if after <= ACCEPTED * before => outcome(poses, true, Some(after), adjusted),
+            after => outcome(poses, false, after.map(|(after, _)| after), made),
+        }
     }
 
     /// Finds poses in cycles of a fit and a step of the poses.
@@ -118,7 +135,8 @@ impl Adjuster<'_> {
                 observe(f64::from(number) / f64::from(n_cycles + 2))?;
                 let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
                 let config = stage.config(self.config, seed);
-                let Some(trainer) = self.fit(&poses, &config, Pruning::Off)? else { return Ok(None) };
+                let Some(fit) = self.fit(&self.stands.at(&poses), &config, Pruning::Off)? else { return Ok(None) };
+                let trainer = fit.trainer;
                 let mut next = poses.clone();
                 let mut field = FieldInLoop::new(&trainer, &self.stands);
                 for _ in 0..STEPS {
@@ -137,18 +155,35 @@ impl Adjuster<'_> {
         Ok(Some(poses))
     }
 
-    /// Misfit of a fit with the settings of the run.
-    fn misfit(&self, poses: &Poses) -> Result<Option<f64>> {
-        let Some(trainer) = self.fit(poses, self.config, Pruning::On)? else { return Ok(None) };
-        Ok(Some(misfit(trainer.targets(), &trainer.images()?)))
+    /// Returns the dataset at poses, with the rays that a run computes from their geometry, to the bit.
+    fn as_in_a_run(&self, poses: &Poses) -> Result<Dataset> {
+        let mut dataset = self.stands.at(poses);
+        if self.is_full_size {
+            for view in &self.stands.views {
+                let view = &mut dataset.views[*view];
+                let rays = view.geometry.rays(view.size[0], view.size[1]);
+                view.rays = rays.map_err(|(field, problem)| {
+                    Error::Internal(format!("an adjusted view has an impossible geometry: {field} {problem}"))
+                })?;
+            }
+        }
+        Ok(dataset)
     }
 
-    /// Fits a deformable set at poses; none where the data do not ask for one.
-    fn fit(&self, poses: &Poses, config: &Config, pruning: Pruning) -> Result<Option<DeformableTrainer>> {
-        let dataset = self.stands.at(poses);
-        let half = dynamic_half(config, &dataset);
-        let motion = SoftMotion::carved(self.evidence.clone(), &dataset, half, SOFT_HULL_CELLS);
-        let targets = match Targets::new(&dataset, &motion, &config.gaussians) {
+    /// Fits with the settings of the run; returns the misfit and the fit.
+    fn compared(&self, dataset: &Dataset) -> Result<Option<(f64, MadeGaussians)>> {
+        let Some(Fitted { trainer, losses, fingerprint }) = self.fit(dataset, self.config, Pruning::On)? else {
+            return Ok(None);
+        };
+        let gaussians = DynamicGaussians::Deformable(trainer.deformable()?);
+        Ok(Some((misfit(trainer.targets(), &trainer.images()?), MadeGaussians { gaussians, losses, fingerprint })))
+    }
+
+    /// Fits a deformable set; none where the data do not ask for one.
+    fn fit(&self, dataset: &Dataset, config: &Config, pruning: Pruning) -> Result<Option<Fitted>> {
+        let half = dynamic_half(config, dataset);
+        let motion = SoftMotion::carved(self.evidence.clone(), dataset, half, SOFT_HULL_CELLS);
+        let targets = match Targets::new(dataset, &motion, &config.gaussians) {
             // The plan of the run tells what is missing.
             Err(Error::Config { .. }) => return Ok(None),
             targets => targets?,
@@ -156,14 +191,16 @@ impl Adjuster<'_> {
         if targets.form(config.gaussians.form) != GaussianForm::Deformable {
             return Ok(None);
         }
+        let fingerprint = fingerprint(&targets, config);
         let mut trainer = DeformableTrainer::new(self.gpu, targets, config)?;
         if pruning == Pruning::Off {
             trainer.keep_unsupported();
         }
+        let mut losses = Vec::new();
         while trainer.step() < config.gaussians.iterations {
-            trainer.advance(config.gaussians.iterations)?;
+            losses.extend(trainer.advance(config.gaussians.iterations)?);
         }
-        Ok(Some(trainer))
+        Ok(Some(Fitted { trainer, losses, fingerprint }))
     }
 }
 

@@ -92,6 +92,10 @@ fn hull_and_targets(config: &Config, dataset: &Dataset, notes: &mut Vec<String>)
         }
         _ => "each phase has its own set of Gaussians (gaussians.form = \"phase\")".into(),
     });
+    if let (fits, Some(reason)) = targets.fits(config.gaussians.fits) {
+        notes
+            .push(format!("the Gaussians are the mean of {fits} fits with different seeds, {reason} (gaussians.fits)"));
+    }
     Ok((soft.hull.to_hull(), targets))
 }
 

@@ -386,6 +386,7 @@ impl DeformableTrainer {
             rows: self.gpu.download(&self.particles.gaussians, 0, n)?,
             step: self.step,
             is_crowd: false,
+            agreement: None,
             intensities: None,
         };
         rest.check()?;

@@ -11,6 +11,7 @@ use crate::gpu::record::PassTime;
 use crate::methods::dynamic_gaussians::carried::Carried;
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use crate::methods::dynamic_gaussians::fine::Fine;
+use crate::methods::dynamic_gaussians::made::Made;
 use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
 use crate::methods::dynamic_gaussians::start::DeformableStart;
 use crate::methods::dynamic_gaussians::targets::Targets;
@@ -23,6 +24,8 @@ pub(crate) enum GaussianFit {
     Start(Box<DeformableStart>, Option<Box<Fine>>),
     /// One set for the beat, likewise.
     Deformable(Box<DeformableTrainer>, Option<Box<Fine>>),
+    /// A fit that was made before.
+    Made(Box<Made>),
 }
 
 impl GaussianFit {
@@ -67,13 +70,16 @@ impl GaussianFit {
         match self {
             GaussianFit::PerPhase(fit) => fit.step() >= end / 2,
             GaussianFit::Start(start, _) => start.has_set_per_phase(),
-            GaussianFit::Deformable(..) => true,
+            GaussianFit::Deformable(..) | GaussianFit::Made(_) => true,
         }
     }
 
     /// Tells whether the fit uses coarser images so far.
     pub(crate) fn is_coarse(&self) -> bool {
-        matches!(self, GaussianFit::Start(_, Some(_)) | GaussianFit::Deformable(_, Some(_)))
+        match self {
+            GaussianFit::Start(_, fine) | GaussianFit::Deformable(_, fine) => fine.is_some(),
+            GaussianFit::PerPhase(_) | GaussianFit::Made(_) => false,
+        }
     }
 
     /// Iterations done.
@@ -82,6 +88,7 @@ impl GaussianFit {
             GaussianFit::PerPhase(fit) => fit.step(),
             GaussianFit::Start(..) => 0,
             GaussianFit::Deformable(fit, _) => fit.step(),
+            GaussianFit::Made(fit) => fit.step(),
         }
     }
 
@@ -89,7 +96,7 @@ impl GaussianFit {
     pub(crate) fn preparation(&self) -> Option<f64> {
         match self {
             GaussianFit::Start(start, _) => Some(start.share()),
-            GaussianFit::PerPhase(_) | GaussianFit::Deformable(..) => None,
+            GaussianFit::PerPhase(_) | GaussianFit::Deformable(..) | GaussianFit::Made(_) => None,
         }
     }
 
@@ -116,6 +123,7 @@ impl GaussianFit {
                 }
                 fit.advance(until.min(from))
             }
+            GaussianFit::Made(fit) => Ok(fit.advance(until)),
         }
     }
 
@@ -128,6 +136,7 @@ impl GaussianFit {
             GaussianFit::PerPhase(fit) => DynamicGaussians::PerPhase(fit.model()?),
             GaussianFit::Start(start, _) => DynamicGaussians::PerPhase(start.field()?),
             GaussianFit::Deformable(fit, _) => DynamicGaussians::Deformable(fit.deformable()?),
+            GaussianFit::Made(fit) => fit.field().clone(),
         })
     }
 
@@ -137,6 +146,7 @@ impl GaussianFit {
             GaussianFit::PerPhase(fit) => fit.count(),
             GaussianFit::Start(start, _) => start.count(),
             GaussianFit::Deformable(fit, _) => fit.count(),
+            GaussianFit::Made(fit) => fit.field().rows().rows.len() as u32,
         }
     }
 
@@ -145,6 +155,7 @@ impl GaussianFit {
         match self {
             GaussianFit::PerPhase(_) => GaussianForm::Phase,
             GaussianFit::Start(..) | GaussianFit::Deformable(..) => GaussianForm::Deformable,
+            GaussianFit::Made(fit) => fit.field().form(),
         }
     }
 
@@ -157,6 +168,7 @@ impl GaussianFit {
             GaussianFit::PerPhase(fit) => fit.profile_step(),
             GaussianFit::Start(..) => Err(not_begun()),
             GaussianFit::Deformable(fit, _) => fit.profile_step(),
+            GaussianFit::Made(_) => Err(not_begun()),
         }
     }
 
@@ -169,12 +181,13 @@ impl GaussianFit {
             GaussianFit::PerPhase(fit) => fit.work(),
             GaussianFit::Start(..) => Err(not_begun()),
             GaussianFit::Deformable(fit, _) => fit.work(),
+            GaussianFit::Made(_) => Err(not_begun()),
         }
     }
 }
 
 fn not_begun() -> Error {
-    Error::Internal("the iterations of the deformable set have not begun".into())
+    Error::Internal("no iteration of the Gaussians is under way".into())
 }
 
 impl TimedFit for GaussianFit {

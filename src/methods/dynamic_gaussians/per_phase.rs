@@ -210,6 +210,7 @@ impl GaussianTrainer {
             rows: self.gpu.download(&self.particles.gaussians, 0, self.n as usize)?,
             step: self.step,
             is_crowd: false,
+            agreement: None,
             intensities: None,
         };
         model.check()?;

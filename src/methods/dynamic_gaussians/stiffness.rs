@@ -6,16 +6,21 @@ use crate::raster::percentile;
 
 /// Number of views up to which the motion is stiff in noise: with few views, free motion explains noise.
 const FEW_VIEWS: usize = 3;
-/// Noise of the median pixel, as a share of the strongest change, from which on the motion is stiff: 1e5 photons give 0.10, 2e4
+/// Noise of the median pixel, as a share of the strongest change, from which on images are noisy: 1e5 photons give 0.10, 2e4
 /// photons 0.22.
 const NOISY: f32 = 0.15;
 /// Minimum penalty on squared differences of neighbouring nodes in stiff motion.
 const STIFF_SMOOTHNESS: f64 = 0.02;
 
 impl Targets {
+    /// Tells whether noise is so strong that a fit explains much of it.
+    pub fn is_noisy(&self) -> bool {
+        percentile(&self.noise, 0.5) >= NOISY
+    }
+
     /// Tells whether the motion of a deformable set is limited to that of a smooth grid.
     pub fn needs_stiff_motion(&self) -> bool {
-        self.n_views <= FEW_VIEWS && percentile(&self.noise, 0.5) >= NOISY
+        self.n_views <= FEW_VIEWS && self.is_noisy()
     }
 
     /// Returns the settings of a deformable set with lengths in pixels of the images and the freedom of motion that noise allows.

@@ -13,14 +13,15 @@ use crate::gpu::record::PassTime;
 use crate::kernels::tuning::Tuning;
 use crate::methods::dynamic_gaussians::data::{GaussianData, Shot};
 use crate::methods::dynamic_gaussians::fit::GaussianFit;
+use crate::methods::dynamic_gaussians::repeated::Repeated;
 use std::any::Any;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Gaussians of a run, and the static field behind them.
 pub struct GaussiansFit {
     gpu: Gpu,
-    /// Fit of the Gaussians, until its iterations are done; the static field begins then.
-    gaussians: Option<GaussianFit>,
+    /// Fits of the Gaussians, until their iterations are done; the static field begins then.
+    gaussians: Option<Repeated>,
     feed: GaussianFeed,
     /// Whether the field of earlier data is shown, until the fit has a better one.
     shows_earlier: bool,
@@ -38,7 +39,7 @@ impl GaussiansFit {
     /// from, where they can be.
     ///
     /// # Errors
-    /// Errors of [`GaussianFit::new`] and [`FieldsFit::new`].
+    /// Errors of [`Repeated::new`] and [`FieldsFit::new`].
     pub(crate) fn new(data: GaussianData, start: &FitStart<'_>) -> Result<GaussiansFit> {
         let GaussianData { targets, fields, shots } = data;
         let (gpu, config) = (start.gpu, start.config);
@@ -46,7 +47,11 @@ impl GaussiansFit {
         let earlier = match start.from {
             Beginning::CarriedOn(saved) => saved.field.gaussians.as_ref(),
             Beginning::AfterGaussians(gaussians) => Some(gaussians),
-            Beginning::Scratch | Beginning::Resumed(_) => None,
+            Beginning::Scratch | Beginning::Made(_) | Beginning::Resumed(_) => None,
+        };
+        let made = match start.from {
+            Beginning::Made(made) => Some(made),
+            _ => None,
         };
         let done = resumed.and_then(SavedFields::of).map_or(0, |saved| saved.step());
         let end = config.gaussian_iterations();
@@ -55,8 +60,8 @@ impl GaussiansFit {
             Some(field) => (None, field.clone()),
             None => {
                 let mut fit = match earlier {
-                    Some(earlier) => GaussianFit::after(gpu, targets, config, earlier)?,
-                    None => GaussianFit::new(gpu, targets, config)?,
+                    Some(earlier) => Repeated::once(gpu, config, GaussianFit::after(gpu, targets, config, earlier)?),
+                    None => Repeated::new(gpu, targets, config, made)?,
                 };
                 while fit.step() < done {
                     fit.advance(done)?;
@@ -142,7 +147,7 @@ impl Fit for GaussiansFit {
     }
 
     fn preparation(&self) -> Option<f64> {
-        self.gaussians.as_ref().and_then(GaussianFit::preparation)
+        self.gaussians.as_ref().and_then(Repeated::preparation)
     }
 
     fn shows_earlier(&self) -> bool {

@@ -133,6 +133,7 @@ impl R2Data {
             rows: of_phases.into_iter().map(|(i, phase)| convert(&rows[i], phase)).collect(),
             step,
             is_crowd: true,
+            agreement: None,
             intensities: None,
         }
     }

@@ -147,6 +147,7 @@ impl XData {
             rows,
             step,
             is_crowd: true,
+            agreement: None,
             intensities: Some(intensities),
         }
     }

@@ -1,0 +1,217 @@
+//! The mean of several dynamic fields that were fitted to the same images, and their agreement. Errors that the fits do not share
+//! are fainter in the mean.
+
+use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, scales, vessel_density};
+use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
+use glam::{DMat3, DQuat, DVec3};
+use rayon::prelude::*;
+use std::f64::consts::TAU;
+
+/// Attenuation, as a share of the density of the vessels, from which a place counts as vessel.
+const VESSEL_SHARE: f64 = 0.2;
+
+impl DynamicGaussians {
+    /// Returns the field whose attenuation is the mean of those of `members` times `factor`; `None` without members or where their
+    /// forms differ. All were fitted to the same images. The mean of deformable sets has the grid of the first: own motion of the
+    /// Gaussians takes up what theirs differs by, exactly at the phases and between them.
+    pub fn mean(members: &[DynamicGaussians], factor: f64) -> Option<DynamicGaussians> {
+        let first = members.first()?;
+        let share = (factor / members.len() as f64).ln() as f32;
+        let fainter = |g: &Gaussian| Gaussian { log_density: g.log_density + share, ..*g };
+        let rows = members.iter().flat_map(|member| member.rows().rows.iter().map(fainter)).collect();
+        let rows = Gaussians { rows, agreement: agreement(members), ..first.rows().clone() };
+        if members.iter().all(|member| member.deformable().is_none()) {
+            return Some(DynamicGaussians::PerPhase(rows));
+        }
+        let sets: Vec<&DeformableGaussians> =
+            members.iter().map(DynamicGaussians::deformable).collect::<Option<_>>()?;
+        let grid = sets.first()?;
+        let own = sets.iter().flat_map(|set| (0..set.rest.rows.len()).flat_map(|i| own_on_grid(set, i, grid)));
+        Some(DynamicGaussians::Deformable(DeformableGaussians {
+            own: own.collect(),
+            setup: DeformableSetup { n_basis: full_basis(rows.n_phases) as u32, ..grid.setup },
+            rest: rows,
+            grid: grid.grid.clone(),
+        }))
+    }
+}
+
+/// Number of basis functions that express any motion at the phases of a beat.
+fn full_basis(n_phases: usize) -> usize {
+    2 * (n_phases / 2)
+}
+
+/// Returns the own motion that a Gaussian of a set needs on another grid, as coefficients of [`full_basis`] functions.
+fn own_on_grid(set: &DeformableGaussians, index: usize, grid: &DeformableGaussians) -> Vec<[f32; 4]> {
+    let (n, rest_phase) = (set.rest.n_phases, set.setup.rest_phase as usize);
+    let at_rest = DVec3::from_array(set.rest.rows[index].position.map(f64::from));
+    let own = |since_rest: usize| {
+        let phase = ((rest_phase + since_rest) % n) as f64;
+        set.position(index, phase) - grid.carried(at_rest, phase)
+    };
+    let own: Vec<DVec3> = (0..n).map(own).collect();
+    // The discrete Fourier transform; motion vanishes at rest, as the basis functions do.
+    let coefficient = |k: usize, wave: fn(f64) -> f64| -> DVec3 {
+        let of = |(t, x): (usize, &DVec3)| *x * wave(TAU * (k * t) as f64 / n as f64);
+        let sum: DVec3 = own.iter().enumerate().map(of).sum();
+        sum * if 2 * k == n { 1.0 } else { 2.0 } / n as f64
+    };
+    let harmonics = 1..=full_basis(n) / 2;
+    let cosines = harmonics.clone().map(|k| coefficient(k, f64::cos));
+    let sines = harmonics.map(|k| if 2 * k == n { DVec3::ZERO } else { coefficient(k, f64::sin) });
+    cosines.chain(sines).map(|v| v.extend(0.0).as_vec4().to_array()).collect()
+}
+
+/// Returns the mean, over pairs of fields and over phases, of the share of one field's attenuation that lies in vessels of the other;
+/// `None` with fewer than two fields.
+fn agreement(members: &[DynamicGaussians]) -> Option<f64> {
+    let n_phases = members.first()?.rows().n_phases;
+    let pairs: Vec<(usize, usize, usize)> = (0..members.len())
+        .flat_map(|a| (0..members.len()).filter(move |b| *b != a).map(move |b| (a, b)))
+        .flat_map(|(a, b)| (0..n_phases).map(move |phase| (a, b, phase)))
+        .collect();
+    let sums: Vec<[f64; 2]> =
+        pairs.par_iter().map(|(a, b, phase)| within(&members[*a], &members[*b], *phase)).collect();
+    let [inside, all] = sums.iter().fold([0.0; 2], |[i, a], [inside, all]| [i + inside, a + all]);
+    (all > 0.0).then(|| inside / all)
+}
+
+/// Returns the attenuation of a field at a phase that lies in vessels of another, and all of it.
+fn within(field: &DynamicGaussians, other: &DynamicGaussians, phase: usize) -> [f64; 2] {
+    let (rows, of_other) = (field.at(phase), other.at(phase));
+    let (setup, other_setup) = (&field.rows().setup, &other.rows().setup);
+    let vessel = VESSEL_SHARE * vessel_density(&of_other, other_setup);
+    let shapes: Vec<Shape> = of_other.iter().map(|g| Shape::new(g, other_setup)).collect();
+    let mut sums = [0.0; 2];
+    for g in &rows {
+        let mass = f64::from(g.log_density).exp() * scales(g, setup).element_product();
+        let x = DVec3::from_array(g.position.map(f64::from));
+        let density: f64 = shapes.iter().map(|shape| shape.density(x)).sum();
+        sums[0] += if density >= vessel { mass } else { 0.0 };
+        sums[1] += mass;
+    }
+    sums
+}
+
+/// A Gaussian, prepared for its density at many points.
+struct Shape {
+    position: DVec3,
+    density: f64,
+    /// From pixels to standard deviations.
+    to_deviations: DMat3,
+    /// Distance, pixels, from which on its density is zero.
+    reach: f64,
+    cut: f64,
+}
+
+impl Shape {
+    fn new(g: &Gaussian, setup: &GaussianSetup) -> Shape {
+        let [w, x, y, z] = g.rotation.map(f64::from);
+        let scales = scales(g, setup);
+        let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
+        Shape {
+            position: DVec3::from_array(g.position.map(f64::from)),
+            density: f64::from(g.log_density).exp(),
+            to_deviations: DMat3::from_diagonal(scales.recip()) * axes.transpose(),
+            reach: f64::from(setup.cut) * scales.max_element(),
+            cut: f64::from(setup.cut),
+        }
+    }
+
+    fn density(&self, point: DVec3) -> f64 {
+        let from_centre = point - self.position;
+        if from_centre.length_squared() > self.reach.powi(2) {
+            return 0.0;
+        }
+        let squared = (self.to_deviations * from_centre).length_squared();
+        if squared > self.cut.powi(2) { 0.0 } else { self.density * (-0.5 * squared).exp() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gaussians::field::{Units, basis, inverse_step, rotation_none};
+    use crate::random::uniform01;
+
+    const NODES: u32 = 3;
+
+    /// A deformable set whose grid and own motion are drawn from a seed.
+    fn set(seed: u32, n_phases: usize, n_basis: u32, rest_phase: u32) -> DynamicGaussians {
+        let number = |round: usize, i: usize| (uniform01(seed, 7, round as u32, i as u32) - 0.5) as f32;
+        let rows: Vec<Gaussian> = (0..4)
+            .map(|i| Gaussian {
+                position: [0, 1, 2].map(|k| 20.0 * number(1, 3 * i + k)),
+                rotation: rotation_none(),
+                ..Gaussian::default()
+            })
+            .collect();
+        let setup = DeformableSetup {
+            n_nodes: NODES,
+            half_side: 12.0,
+            inverse_step: inverse_step(NODES, 12.0),
+            n_basis,
+            rest_phase,
+            ..DeformableSetup::default()
+        };
+        let vectors = |round: usize, n: usize| -> Vec<[f32; 4]> {
+            (0..n).map(|i| [number(round, 3 * i), number(round, 3 * i + 1), number(round, 3 * i + 2), 0.0]).collect()
+        };
+        let mut grid = vectors(2, n_phases * setup.nodes());
+        grid[rest_phase as usize * setup.nodes()..][..setup.nodes()].fill([0.0; 4]);
+        let own = vectors(3, rows.len() * n_basis as usize);
+        let limits = GaussianSetup { min_scale: 0.5, max_scale: 3.0, cut: 3.2, ..GaussianSetup::default() };
+        let rest = Gaussians {
+            units: Units { pixel: 0.01, strongest: 0.2 },
+            n_phases,
+            setup: limits,
+            rows,
+            step: 5,
+            is_crowd: false,
+            intensities: None,
+            agreement: None,
+        };
+        DynamicGaussians::Deformable(DeformableGaussians { rest, setup, grid, own })
+    }
+
+    #[test]
+    fn gaussians_of_the_mean_move_as_in_their_own_fit() {
+        for (n_phases, rest_phase) in [(10, 3), (7, 0), (4, 1)] {
+            let basis = 2 * ((n_phases as u32 - 1) / 2);
+            let members = [set(1, n_phases, basis, rest_phase), set(2, n_phases, basis, rest_phase)];
+            let mean = DynamicGaussians::mean(&members, 1.5).unwrap();
+            for phase in [0.0, 1.0, 2.4, n_phases as f64 - 0.3] {
+                let want: Vec<Gaussian> = members.iter().flat_map(|member| member.at_time(phase)).collect();
+                let got = mean.at_time(phase);
+                assert_eq!(got.len(), want.len());
+                for (got, want) in got.iter().zip(&want) {
+                    let apart = (0..3).map(|k| (got.position[k] - want.position[k]).abs()).fold(0.0, f32::max);
+                    assert!(apart < 1e-4, "{n_phases} phases, phase {phase}: {apart} pixels");
+                    assert!((got.log_density - want.log_density - 0.75f32.ln()).abs() < 1e-6);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn fields_agree_where_both_have_vessels() {
+        let one = set(1, 4, 2, 0);
+        let twice = DynamicGaussians::mean(&[one.clone(), one.clone()], 1.0).unwrap();
+        assert_eq!(twice.rows().agreement, Some(1.0));
+        let away = |field: &DynamicGaussians, n: usize| {
+            let DynamicGaussians::Deformable(mut set) = field.clone() else { unreachable!() };
+            set.rest.rows.iter_mut().take(n).for_each(|g| g.position[0] += 200.0);
+            DynamicGaussians::Deformable(set)
+        };
+        let agreement = |n: usize| DynamicGaussians::mean(&[one.clone(), away(&one, n)], 1.0).unwrap().rows().agreement;
+        assert_eq!((agreement(4), agreement(1)), (Some(0.0), Some(0.75)));
+        assert_eq!(DynamicGaussians::mean(&[one], 1.0).unwrap().rows().agreement, None);
+    }
+
+    #[test]
+    fn a_full_basis_reaches_every_phase() {
+        assert_eq!([1, 2, 3, 10, 11].map(full_basis), [0, 2, 2, 10, 10]);
+        // With an even number of phases, the last sine vanishes at all phases.
+        assert!((0..10).all(|t| basis(10, f64::from(t) / 10.0)[9].abs() < 1e-12));
+    }
+}

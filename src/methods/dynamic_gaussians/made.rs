@@ -1,0 +1,60 @@
+//! A fit that was made before its run began, while views were adjusted: a run with the same images, geometry and settings does not repeat
+//! it.
+
+use crate::config::Config;
+use crate::fingerprint::Fingerprint;
+use crate::fitting::fit::MadeGaussians;
+use crate::gaussians::field::DynamicGaussians;
+use crate::methods::dynamic_gaussians::targets::Targets;
+
+/// A fit that is done, whose losses are still to be reported.
+pub(crate) struct Made {
+    fit: MadeGaussians,
+    step: u32,
+}
+
+impl Made {
+    /// Takes over a fit if it is one of these targets and settings, and if no state between its first and last iteration is scored. A
+    /// checkpoint that is saved meanwhile holds the field after all iterations; a run that is resumed there repeats the fit.
+    pub(crate) fn of(made: &MadeGaussians, targets: &Targets, config: &Config) -> Option<Made> {
+        let end = config.gaussian_iterations();
+        let every = config.train.validate_every;
+        let whole = made.losses.len() == end as usize && (every == 0 || every >= end);
+        (whole && made.fingerprint == fingerprint(targets, config)).then(|| Made { fit: made.clone(), step: 0 })
+    }
+
+    /// Returns the iterations whose losses were reported.
+    pub(crate) fn step(&self) -> u32 {
+        self.step
+    }
+
+    /// Returns the losses of the iterations up to `until`.
+    pub(crate) fn advance(&mut self, until: u32) -> Vec<f64> {
+        let first = self.step as usize;
+        let end = (until as usize).clamp(first, self.fit.losses.len());
+        self.step = end as u32;
+        self.fit.losses[first..end].to_vec()
+    }
+
+    /// Returns the field after all iterations.
+    pub(crate) fn field(&self) -> &DynamicGaussians {
+        &self.fit.gaussians
+    }
+}
+
+/// Returns the fingerprint of all that decides a fit that has not begun.
+pub(crate) fn fingerprint(targets: &Targets, config: &Config) -> String {
+    let mut fingerprint = Fingerprint::default();
+    let images = [&targets.images, &targets.low, &targets.high, &targets.weight, &targets.noise, &targets.contrast];
+    images.into_iter().flatten().for_each(|v| fingerprint.word(v.to_bits()));
+    for view in &targets.views {
+        fingerprint.bytes(format!("{view:?}").as_bytes());
+    }
+    for place in targets.places.iter().flatten() {
+        let numbers = place.position.to_array().into_iter().chain([place.evidence]);
+        numbers.for_each(|v| fingerprint.bytes(&v.to_bits().to_le_bytes()));
+    }
+    let rest = (targets.units, targets.width, &targets.image_of, targets.lengths, targets.rest_phase, targets.cell);
+    fingerprint.bytes(format!("{rest:?} {} {:?} {:?}", config.seed, config.gaussians, config.deformable).as_bytes());
+    fingerprint.hex()
+}

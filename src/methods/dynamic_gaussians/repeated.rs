@@ -1,0 +1,169 @@
+//! Several fits to the same images, whose mean is the dynamic field: each fit to noisy or inconsistent images has errors of its own.
+
+use crate::config::Config;
+use crate::error::{Error, Result};
+use crate::fitting::fit::MadeGaussians;
+use crate::gaussians::field::DynamicGaussians;
+use crate::gpu::device::Gpu;
+use crate::methods::dynamic_gaussians::fit::GaussianFit;
+use crate::methods::dynamic_gaussians::made::Made;
+use crate::methods::dynamic_gaussians::targets::Targets;
+
+/// Difference of the seeds of one fit and the next.
+const NEXT_SEED: u32 = 1000;
+/// Factor on the mean attenuation. Fits place a vessel next to each other, so that their mean is broader and fainter than the vessel.
+const MEAN_FACTOR: f64 = 4.0 / 3.0;
+/// Number of fits to noisy or inconsistent images. The mean of fits to good images is broader than each of them.
+const FITS: u32 = 3;
+
+impl Targets {
+    /// Returns the number of fits where `asked` leaves it open (0), and the reason for more than one.
+    pub(crate) fn fits(&self, asked: u32) -> (u32, Option<&'static str>) {
+        match asked {
+            0 if self.is_noisy() => (FITS, Some("because the images are noisy")),
+            // Only an adjustment of views finds contrasts of frames.
+            0 if self.contrast.iter().any(|c| *c != 1.0) => (FITS, Some("because the views had to be adjusted")),
+            0 | 1 => (1, None),
+            n => (n, Some("as gaussians.fits says")),
+        }
+    }
+}
+
+/// Fits of a run, one after the other. The last has the run's seed: its iterations are those of the run, and the earlier fits are its
+/// preparation.
+pub(crate) struct Repeated {
+    gpu: Gpu,
+    /// Images of the fits that are left; none for a single fit.
+    targets: Option<Targets>,
+    config: Config,
+    fits: u32,
+    /// Fields of the fits that are done.
+    done: Vec<DynamicGaussians>,
+    /// Mean of these fields, which is shown meanwhile.
+    so_far: Option<DynamicGaussians>,
+    fit: GaussianFit,
+    /// Last fit, where it was made before.
+    made: Option<GaussianFit>,
+    was_coarse: bool,
+}
+
+impl Repeated {
+    /// Begins the number of fits that configuration and data ask for. A fit that was made before is not repeated if it is the same.
+    ///
+    /// # Errors
+    /// As [`GaussianFit::new`].
+    pub(crate) fn new(gpu: &Gpu, targets: Targets, config: &Config, made: Option<&MadeGaussians>) -> Result<Repeated> {
+        let made = made.and_then(|made| Made::of(made, &targets, config)).map(|made| GaussianFit::Made(Box::new(made)));
+        match (targets.fits(config.gaussians.fits).0, made) {
+            (0 | 1, Some(made)) => Ok(Repeated::once(gpu, config, made)),
+            (0 | 1, None) => Ok(Repeated::once(gpu, config, GaussianFit::new(gpu, targets, config)?)),
+            (fits, made) => {
+                let fit = GaussianFit::new(gpu, targets.clone(), &seeded(config, fits - 1))?;
+                Ok(Repeated { fits, made, targets: Some(targets), ..Repeated::once(gpu, config, fit) })
+            }
+        }
+    }
+
+    /// Takes a single fit.
+    pub(crate) fn once(gpu: &Gpu, config: &Config, fit: GaussianFit) -> Repeated {
+        Repeated {
+            gpu: gpu.clone(),
+            targets: None,
+            config: config.clone(),
+            fits: 1,
+            done: Vec::new(),
+            so_far: None,
+            was_coarse: fit.is_coarse(),
+            fit,
+            made: None,
+        }
+    }
+
+    /// Tells whether the field of a fit of `end` iterations is worth more than one that was fitted to fewer frames.
+    pub(crate) fn is_presentable(&self, end: u32) -> bool {
+        self.so_far.is_some() || self.fit.is_presentable(end)
+    }
+
+    fn is_last(&self) -> bool {
+        self.done.len() + 1 >= self.fits as usize
+    }
+
+    /// Tells whether the run's iterations use coarser images so far.
+    pub(crate) fn is_coarse(&self) -> bool {
+        if self.is_last() { self.fit.is_coarse() } else { self.was_coarse }
+    }
+
+    /// Returns the iterations of the run that are done.
+    pub(crate) fn step(&self) -> u32 {
+        if self.is_last() { self.fit.step() } else { 0 }
+    }
+
+    /// Returns the share done of the preparation before the first iteration of the run; none when that has begun.
+    pub(crate) fn preparation(&self) -> Option<f64> {
+        let of_fit = match self.fit.preparation() {
+            Some(share) if self.is_last() => share,
+            None if self.is_last() => return None,
+            Some(share) => 0.5 * share,
+            None => 0.5 + 0.5 * f64::from(self.fit.step()) / f64::from(self.config.gaussian_iterations().max(1)),
+        };
+        Some((self.done.len() as f64 + of_fit) / f64::from(self.fits))
+    }
+
+    /// Runs some iterations towards `until`; returns the losses of those of the run.
+    ///
+    /// # Errors
+    /// As [`GaussianFit::advance`].
+    pub(crate) fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
+        if self.is_last() {
+            return self.fit.advance(until);
+        }
+        let end = self.config.gaussian_iterations();
+        self.fit.advance(end)?;
+        if self.fit.step() >= end {
+            self.done.push(self.fit.field()?);
+            self.so_far = Some(mean(&self.done)?);
+            let left = self.fits.saturating_sub(1 + self.done.len() as u32);
+            self.fit = match self.made.take_if(|_| left == 0) {
+                Some(made) => made,
+                None => {
+                    let targets = self.images(left)?;
+                    GaussianFit::new(&self.gpu, targets, &seeded(&self.config, left))?
+                }
+            };
+        }
+        Ok(Vec::new())
+    }
+
+    /// Returns the images of a fit that is followed by so many others. The last fit takes them over.
+    fn images(&mut self, left: u32) -> Result<Targets> {
+        let images = if left == 0 { self.targets.take() } else { self.targets.clone() };
+        images.ok_or_else(|| Error::Internal("there are no images for another fit".into()))
+    }
+
+    /// Returns the field: the mean of all fits that are done, or the field of the first fit.
+    ///
+    /// # Errors
+    /// As [`GaussianFit::field`]; [`Error::Internal`] where the fits have different forms.
+    pub(crate) fn field(&self) -> Result<DynamicGaussians> {
+        let Some(so_far) = &self.so_far else { return self.fit.field() };
+        if !self.is_last() || self.fit.step() < self.config.gaussian_iterations() {
+            return Ok(so_far.clone());
+        }
+        let all: Vec<DynamicGaussians> = self.done.iter().cloned().chain([self.fit.field()?]).collect();
+        mean(&all)
+    }
+}
+
+/// Returns the mean of fits; a single one as it is.
+fn mean(fields: &[DynamicGaussians]) -> Result<DynamicGaussians> {
+    let mean = match fields {
+        [field] => Some(field.clone()),
+        fields => DynamicGaussians::mean(fields, MEAN_FACTOR),
+    };
+    mean.ok_or_else(|| Error::Internal("repeated fits to the same images have different forms".into()))
+}
+
+/// Returns the settings of a fit that is followed by so many others.
+fn seeded(config: &Config, left: u32) -> Config {
+    Config { seed: config.seed.wrapping_add(NEXT_SEED * left), ..config.clone() }
+}
