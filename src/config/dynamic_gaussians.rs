@@ -65,6 +65,8 @@ section! {
         /// Interval, in iterations, at which the static background is estimated again from the images minus the Gaussians; not
         /// while rates fall; 0 = never.
         background_every: u32 in 0.0 to 1e6,
+        /// Leave out a catheter: Gaussians of a deformable set whose motion ends along a line.
+        #[serde(default)] without_catheter: bool,
     }
 }
 
@@ -126,6 +128,7 @@ pub(super) fn gaussians() -> Gaussians {
         link: 4.0,
         missing: 0.03,
         background_every: 40,
+        without_catheter: false,
     }
 }
 
@@ -203,6 +206,13 @@ impl MethodSettings for Settings {
 
     fn is_key(&self, _: Preset, key: &str) -> bool {
         TENSOR_KEYS.contains(&key)
-            || ["calibrate.adjust", "gaussians.form", "gaussians.iterations", "gaussians.count"].contains(&key)
+            || [
+                "calibrate.adjust",
+                "gaussians.form",
+                "gaussians.iterations",
+                "gaussians.count",
+                "gaussians.without_catheter",
+            ]
+            .contains(&key)
     }
 }
