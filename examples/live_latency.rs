@@ -112,7 +112,7 @@ fn new_frame(dataset: &Dataset, frame: &Frame) -> NewFrame {
         split: own.split,
         width: view.size[0],
         height: view.size[1],
-        integrals: own.integrals,
+        integrals: own.integrals.into_vec(),
         mask: own.mask,
     }
 }

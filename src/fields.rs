@@ -7,6 +7,7 @@
 
 pub mod carve;
 pub mod data;
+pub mod images;
 pub mod motion;
 pub mod scale;
 mod schedule;

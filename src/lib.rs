@@ -115,6 +115,7 @@ pub mod scan {
     pub mod gating;
     pub(crate) mod hidden;
     pub mod nerfca;
+    pub mod pixels;
     mod reading;
     pub(crate) mod same_view;
     pub mod truth;
@@ -238,6 +239,7 @@ pub mod trees {
     mod radii;
     mod refine;
     mod sampled;
+    mod solid;
     mod tidy;
     pub mod tree;
     mod tubes;

@@ -8,6 +8,8 @@
 #include "inc/random.glsl"
 #include "inc/pixel_ray.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
+// Frames whose line integrals are in `images`, `first_frame` to below `end_frame`; rays of other frames are left as they are.
+layout(push_constant) uniform Push { uint first_frame; uint end_frame; } push;
 layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { View views[]; };
@@ -35,7 +37,9 @@ void main() {
         id = draw(r - setup.n_motion_rays, setup.n_rays - setup.n_motion_rays, n, STREAM_RAY);
         if (!all) id = listed_rays[setup.n_motion_list + id];
     }
-    Frame frame = frames[id / setup.n_pixels];
+    uint index = id / setup.n_pixels;
+    if (index < push.first_frame || index >= push.end_frame) return;
+    Frame frame = frames[index];
     View view = views[frame.view];
     uint pixel = id % setup.n_pixels;
     Line line = line_through(view, pixel, setup.image_width);

@@ -98,7 +98,8 @@ pub(crate) fn coarsened_for_calibration(dataset: &Dataset) -> Dataset {
 
 /// Bins the training frames.
 fn coarsened(dataset: &Dataset, factor: usize) -> Dataset {
-    let frame = |f: &Frame| Frame { integrals: binned(&f.integrals, dataset.width, factor), mask: None, ..f.clone() };
+    let frame =
+        |f: &Frame| Frame { integrals: binned(&f.integrals, dataset.width, factor).into(), mask: None, ..f.clone() };
     let mut coarse = Dataset {
         frames: dataset.training().par_iter().map(frame).collect(),
         hidden: dataset.hidden.iter().map(|(v, h)| (*v, binned_hidden(h, dataset.width, factor))).collect(),

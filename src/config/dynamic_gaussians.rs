@@ -72,6 +72,8 @@ section! {
         /// Number of fits with different seeds whose mean is the dynamic field; 0 = three where images are noisy or views were adjusted,
         /// else one; 1 is the default for older files without this setting.
         #[serde(default = "one_fit")] fits: u32 in 0.0 to 9.0,
+        /// Leave out a catheter: Gaussians of a deformable set whose motion ends along a line.
+        #[serde(default)] without_catheter: bool,
     }
 }
 
@@ -134,6 +136,7 @@ pub(super) fn gaussians() -> Gaussians {
         missing: 0.03,
         background_every: 40,
         fits: 1,
+        without_catheter: false,
     }
 }
 
@@ -211,7 +214,14 @@ impl MethodSettings for Settings {
 
     fn is_key(&self, _: Preset, key: &str) -> bool {
         TENSOR_KEYS.contains(&key)
-            || ["calibrate.adjust", "gaussians.form", "gaussians.iterations", "gaussians.count", "gaussians.fits"]
-                .contains(&key)
+            || [
+                "calibrate.adjust",
+                "gaussians.form",
+                "gaussians.iterations",
+                "gaussians.count",
+                "gaussians.fits",
+                "gaussians.without_catheter",
+            ]
+            .contains(&key)
     }
 }

@@ -77,8 +77,8 @@ fn lower_mode(values: &[f32], noise: f32, bias: f32) -> f32 {
 
 impl Background {
     /// Analyses a view.
-    pub fn new(series: &Series) -> Background {
-        let drift = Drift::new(series, &noise(series));
+    pub fn new(series: Series) -> Background {
+        let drift = Drift::new(&series, &noise(&series));
         let stilled = drift.stilled(series);
         let images: Vec<&Image> = stilled.seen().collect();
         let (width, height) = (images[0].width, images[0].height);
@@ -96,9 +96,13 @@ impl Background {
         let wide = opening_radius(WIDE_SHARE, width, height);
         let changes: Vec<Option<Image>> =
             stilled.images.par_iter().map(|seen| Some(narrow_change(seen.as_ref()?, &level, wide))).collect();
-        let smooth: Vec<Image> = changes.par_iter().flatten().map(|c| blur(c, STRONGEST_BLUR)).collect();
-        let max = |p: usize| smooth.iter().map(|c| c.values[p]).fold(f32::MIN, f32::max);
-        let largest: Vec<f32> = (0..width * height).map(max).collect();
+        let largest = changes.par_iter().flatten().map(|c| blur(c, STRONGEST_BLUR).values).reduce(
+            || vec![f32::MIN; width * height],
+            |mut max, values| {
+                max.iter_mut().zip(values).for_each(|(max, value)| *max = max.max(value));
+                max
+            },
+        );
         let strongest = percentile(&largest, STRONGEST_PERCENTILE);
         let floor = (MIN_NOISE_SHARE * strongest).max(f32::MIN_POSITIVE);
         noise.iter_mut().for_each(|s| *s = s.max(floor));

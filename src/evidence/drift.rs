@@ -87,8 +87,7 @@ impl Drift {
     }
 
     /// Returns the images without the wide motion.
-    pub(super) fn stilled(&self, series: &Series) -> Series {
-        let mut stilled = series.clone();
+    pub(super) fn stilled(&self, mut stilled: Series) -> Series {
         for (t, image) in stilled.images.iter_mut().flatten().enumerate() {
             for mode in &self.modes {
                 image.values.iter_mut().zip(&mode.image.values).for_each(|(y, m)| *y -= mode.course[t] * m);
@@ -351,7 +350,7 @@ mod tests {
 
     fn stilled(series: &Series) -> (Series, Option<f32>) {
         let drift = Drift::new(series, &vec![1e-4; SIDE * SIDE]);
-        (drift.stilled(series), drift.size())
+        (drift.stilled(series.clone()), drift.size())
     }
 
     /// Mean, over the pixels about the edge, of the variation of the error over the phases.

@@ -54,6 +54,12 @@ pub struct ViewEvidence {
 impl ViewEvidence {
     /// Analyses a view.
     pub fn new(series: &Series) -> ViewEvidence {
+        ViewEvidence::of(series.clone())
+    }
+
+    /// Analyses a view, whose images are taken over.
+    pub fn of(series: Series) -> ViewEvidence {
+        let view = series.view;
         let background = Background::new(series);
         let ladder = Ladder::new(&background);
         let seen: Vec<Option<Phase>> =
@@ -70,7 +76,7 @@ impl ViewEvidence {
                 Some(ladder.with_covered_pixels(image, phase, &largest, filtered))
             })
             .collect();
-        ViewEvidence { view: series.view, background, ratios }
+        ViewEvidence { view, background, ratios }
     }
 
     /// Places the evidence in the corner of a canvas (columns, rows), and continues its edges there.

@@ -21,11 +21,28 @@ pub struct Series {
 impl Series {
     /// Returns the training images of each view that has at least two phases; several images of one phase are averaged.
     pub fn of(dataset: &Dataset) -> Vec<Series> {
-        let series = dataset.training_views().into_iter().map(|view| Series {
-            view,
-            images: (0..dataset.n_phases).map(|phase| mean_image(dataset, view, phase)).collect(),
-        });
-        series.filter(|s| s.seen().count() > 1).collect()
+        Series::each(dataset).collect()
+    }
+
+    /// Returns the same as [`Series::of`], one view after the other.
+    pub fn each(dataset: &Dataset) -> impl Iterator<Item = Series> {
+        Series::views(dataset).into_iter().map(|view| Series::of_view(dataset, view))
+    }
+
+    /// Returns the training views that have at least two phases.
+    pub fn views(dataset: &Dataset) -> Vec<usize> {
+        let phases = |view: usize| {
+            let mut phases: Vec<u32> = dataset.training().iter().filter(|f| f.view == view).map(|f| f.phase).collect();
+            phases.sort_unstable();
+            phases.dedup();
+            phases.len()
+        };
+        dataset.training_views().into_iter().filter(|view| phases(*view) > 1).collect()
+    }
+
+    /// Returns the training images of a view.
+    pub fn of_view(dataset: &Dataset, view: usize) -> Series {
+        Series { view, images: (0..dataset.n_phases).map(|phase| mean_image(dataset, view, phase)).collect() }
     }
 
     /// Images of the phases the view has.
@@ -36,12 +53,14 @@ impl Series {
 
 fn mean_image(dataset: &Dataset, view: usize, phase: u32) -> Option<Image> {
     let frames: Vec<_> = dataset.training().iter().filter(|f| f.view == view && f.phase == phase).collect();
+    if frames.is_empty() {
+        return None;
+    }
     let scale = 1.0 / frames.len() as f32;
     let images: Vec<_> = frames.iter().map(|f| dataset.own(view, &f.integrals)).collect();
     let [width, height] = dataset.views[view].size;
     let value = |p: usize| images.iter().map(|image| image[p]).sum::<f32>() * scale;
-    let values = (0..width * height).map(value).collect();
-    (!frames.is_empty()).then_some(Image { width, height, values })
+    Some(Image { width, height, values: (0..width * height).map(value).collect() })
 }
 
 /// Radius of an opening, from its share of an image's smaller side.

@@ -10,6 +10,7 @@ use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
 use crate::model::scene::Scene;
 use crate::scan::dataset::{Dataset, Frame};
+use crate::scan::pixels::Pixels;
 
 /// Data of a fit of fields.
 #[derive(Clone)]
@@ -28,8 +29,8 @@ pub struct FieldData {
     pub views: Vec<layout::View>,
     /// Training frames.
     pub frames: Vec<layout::Frame>,
-    /// Line integrals of all training frames.
-    pub images: Vec<f32>,
+    /// Line integrals of each training frame.
+    pub images: Vec<Pixels>,
     /// Bounds of the static background of each pixel of each view.
     pub backgrounds: Vec<[f32; 2]>,
     /// Change of each pixel of each view over the beat where rays are chosen by it; else empty.
@@ -123,7 +124,7 @@ impl FieldData {
             schedule: config.schedule_table(),
             views: motion.iter().map(|m| layout::View::of(&dataset.views[m.view].rays)).collect(),
             frames: frames(dataset, motion),
-            images: training.iter().flat_map(|frame| frame.integrals.iter().copied()).collect(),
+            images: training.iter().map(|frame| frame.integrals.clone()).collect(),
             backgrounds: motion.iter().flat_map(ViewMotion::background_bounds).collect(),
             pixel_changes: lists.pixel_changes,
             listed_rays: lists.rays,
@@ -137,18 +138,19 @@ impl FieldData {
 fn frames(dataset: &Dataset, motion: &[ViewMotion]) -> Vec<layout::Frame> {
     let pixels = dataset.n_pixels();
     let slot = |view: usize| motion.iter().position(|m| m.view == view).map_or(u32::MAX, |slot| slot as u32);
-    let frame = |(index, frame): (usize, &Frame)| {
+    let frame = |frame: &Frame| {
         let (view, taken) = (slot(frame.view), frame.beat_time());
         layout::Frame {
             view,
             phase: frame.phase,
             beyond: taken.beyond(dataset.n_phases),
             beyond_share: taken.after_phase.abs() as f32,
-            image_offset: (index * pixels) as u32,
+            // Follows from the limits of the device.
+            image_offset: 0,
             background_offset: view * pixels as u32,
         }
     };
-    dataset.training().iter().enumerate().map(frame).collect()
+    dataset.training().iter().map(frame).collect()
 }
 
 /// Returns a note on displacements of the heart, which fields ignore, if the dataset states some.

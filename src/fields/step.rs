@@ -10,6 +10,7 @@
 
 use crate::error::Result;
 use crate::fields::data::FieldData;
+use crate::fields::images::{TrainingImages, placed};
 use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
@@ -30,8 +31,6 @@ buffer_set! {
         views,
         /// [`crate::kernels::layout::Frame`]s of the training images.
         frames,
-        /// Line integrals of all training images.
-        images,
         /// Static backgrounds of each view: lower and upper bound per pixel.
         backgrounds,
         /// Change of each pixel of each view, where two networks are the fields.
@@ -75,8 +74,7 @@ impl TrainingBuffers {
         let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
         Ok(TrainingBuffers {
             views: gpu.buffer_with("views", &data.views)?,
-            frames: gpu.buffer_with("frames", &data.frames)?,
-            images: gpu.buffer_with("images", &data.images)?,
+            frames: gpu.buffer_with("frames", &placed(gpu, &data.frames, data.setup.n_pixels as usize))?,
             backgrounds: gpu.buffer_with("backgrounds", &data.backgrounds)?,
             pixel_changes: gpu.buffer_with("pixel_changes", or_one(&data.pixel_changes))?,
             listed_rays: gpu.buffer_with("listed_rays", &data.listed_rays)?,
@@ -132,13 +130,16 @@ pub fn clear<'a>(
     Ok(gpu.wait(recording.finish()?.submit()?)?)
 }
 
-/// Records one iteration.
+/// Records one iteration on the training `images`.
 ///
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
-pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
+pub fn record_step(pass: &mut Pass<'_>, images: &TrainingImages) -> Result<()> {
     let (k, setup) = (pass.kernels, pass.setup);
-    pass.run(&k.batch, k.batch.groups_for(setup.n_rays), push::Batch {})?;
+    for (frames, images) in images.buffers() {
+        let push = push::Batch { first_frame: frames.start, end_frame: frames.end };
+        pass.run_with(&k.batch, k.batch.groups_for(setup.n_rays), &[(Binding::images, images.into())], push)?;
+    }
     pass.weights()?;
     for chunk in chunks(setup, setup.n_rays) {
         pass.samples(chunk)?;

@@ -4,6 +4,7 @@
 use crate::choice::Choice;
 use crate::error::{Error, Result};
 use crate::fields::data::FieldData;
+use crate::fields::images::TrainingImages;
 use crate::fields::setup::sample_capacity;
 use crate::fields::state::{FieldsState, LossScale, PendingFields, REPORT_BYTES};
 use crate::fields::step::{TrainingBuffers, clear, forward_buffers, record_step};
@@ -25,6 +26,7 @@ use crate::network::forward::{ForwardBuffers, occupancy_bytes};
 use crate::network::pass::Pass;
 use crate::network::static_network::StaticNetwork;
 use crate::network::{F32_BYTES, Network, Purpose, largest_chunk};
+use crate::scan::pixels::Pixels;
 use std::any::Any;
 use std::collections::VecDeque;
 use std::time::Instant;
@@ -54,8 +56,10 @@ pub struct FieldsFit {
     pace: SubmitPace,
     /// When the last submit was done, or the one under way began.
     last_completion: Instant,
-    /// One iteration.
-    single: Commands,
+    /// Line integrals of the training images, once they are known.
+    images: Option<TrainingImages>,
+    /// One iteration, once the images are known.
+    single: Option<Commands>,
     /// Several iterations in one recording, as many as a submit takes, once that is known.
     several: Option<(Commands, u32)>,
     in_flight: VecDeque<(Ticket, u32)>,
@@ -129,12 +133,33 @@ fn upload_start(
     Ok(now)
 }
 
+fn without_images() -> Error {
+    Error::Internal("an iteration of the fields was asked for before their images were set".into())
+}
+
 impl FieldsFit {
     /// Begins a fit after `done` iterations, with the fields that were `saved`, if any.
     ///
     /// # Errors
     /// [`Error::Config`] when `tuning` asks for what the device lacks; [`Error::OutOfMemory`]; other device errors.
     pub(crate) fn new(
+        gpu: &Gpu,
+        data: FieldData,
+        tuning: Tuning,
+        saved: Option<SavedFields<'_>>,
+        done: u32,
+    ) -> Result<FieldsFit> {
+        let mut fit = FieldsFit::awaiting_images(gpu, data, tuning, saved, done)?;
+        let integrals = fit.data.images.clone();
+        fit.set_images(|frame| Ok(integrals[frame].clone()))?;
+        Ok(fit)
+    }
+
+    /// Begins a fit like [`FieldsFit::new`] whose images are set later, before the first iteration.
+    ///
+    /// # Errors
+    /// Errors of [`FieldsFit::new`].
+    pub(crate) fn awaiting_images(
         gpu: &Gpu,
         mut data: FieldData,
         tuning: Tuning,
@@ -160,20 +185,6 @@ impl FieldsFit {
         now.step = done.max(data.config.gaussian_iterations());
         gpu.upload(&forward.state, 0, &[now])?;
         let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(data.config.train.iterations_per_submit);
-        let single = {
-            let mut recording = Recording::new(gpu, "training iteration")?;
-            record_step(&mut Pass {
-                recording: &mut recording,
-                kernels: &kernels,
-                network: network.as_ref(),
-                static_network: static_network.as_ref(),
-                buffers: &forward,
-                training: Some(&training),
-                params: &data.params,
-                setup: &data.setup,
-            })?;
-            recording.finish()?
-        };
         Ok(FieldsFit {
             pace: SubmitPace::new(kernels.tuning.longest_submit_s, 1, per_submit).giving_way_to(gpu.looks()),
             gpu: gpu.clone(),
@@ -184,7 +195,8 @@ impl FieldsFit {
             forward,
             training,
             last_completion: Instant::now(),
-            single,
+            images: None,
+            single: None,
             several: None,
             in_flight: VecDeque::new(),
             submitted: done,
@@ -225,12 +237,30 @@ impl FieldsFit {
         }
     }
 
-    /// Replaces the line integrals of the training images.
+    /// Sets the line integrals of the training images: `integrals` returns those of a frame.
     ///
     /// # Errors
-    /// Device errors.
-    pub(crate) fn set_images(&self, images: &[f32]) -> Result<()> {
-        Ok(self.gpu.upload(&self.training.images, 0, images)?)
+    /// [`Error::OutOfMemory`] and other device errors; errors of `integrals`.
+    pub(crate) fn set_images(&mut self, integrals: impl Fn(usize) -> Result<Pixels>) -> Result<()> {
+        let n_frames = self.data.images.len();
+        let images = TrainingImages::new(&self.gpu, n_frames, self.data.setup.n_pixels as usize)?;
+        for frame in 0..n_frames {
+            images.write(&self.gpu, frame, &integrals(frame)?)?;
+        }
+        self.images = Some(images);
+        self.single = Some(self.recorded(1, "training iteration")?);
+        self.several = None;
+        Ok(())
+    }
+
+    /// Records iterations, so many.
+    fn recorded(&self, iterations: u32, name: &str) -> Result<Commands> {
+        let images = self.images.as_ref().ok_or_else(without_images)?;
+        let mut recording = Recording::new(&self.gpu, name)?;
+        for _ in 0..iterations {
+            record_step(&mut self.pass(&mut recording), images)?;
+        }
+        Ok(recording.finish()?)
     }
 
     /// Submits under way at once: one while their duration is being measured.
@@ -244,11 +274,7 @@ impl FieldsFit {
         if !self.pace.is_trying() && n == 1 {
             self.several = None;
         } else if !self.pace.is_trying() && (n < recorded || n >= 2 * recorded) {
-            let mut recording = Recording::new(&self.gpu, &format!("{n} training iterations"))?;
-            for _ in 0..n {
-                record_step(&mut self.pass(&mut recording))?;
-            }
-            self.several = Some((recording.finish()?, n));
+            self.several = Some((self.recorded(n, &format!("{n} training iterations"))?, n));
         }
         Ok(())
     }
@@ -356,7 +382,7 @@ impl Fit for FieldsFit {
             let fits = |(_, n): &&(Commands, u32)| !self.pace.is_trying() && stop - self.submitted >= *n;
             let (commands, n) = match self.several.as_ref().filter(fits) {
                 Some((commands, n)) => (commands, *n),
-                None => (&self.single, 1),
+                None => (self.single.as_ref().ok_or_else(without_images)?, 1),
             };
             self.in_flight.push_back((commands.submit()?, n));
             self.submitted += n;
@@ -387,7 +413,7 @@ impl Fit for FieldsFit {
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         const MAX_PASSES: u32 = 4096;
         let mut recording = Recording::timed(&self.gpu, "profiled iteration", MAX_PASSES)?;
-        record_step(&mut self.pass(&mut recording))?;
+        record_step(&mut self.pass(&mut recording), self.images.as_ref().ok_or_else(without_images)?)?;
         let commands = recording.finish()?;
         self.gpu.wait(commands.submit()?)?;
         self.count(1);
@@ -399,7 +425,7 @@ impl Fit for FieldsFit {
     }
 
     fn barriers(&self) -> Option<u32> {
-        Some(self.single.barriers())
+        self.single.as_ref().map(Commands::barriers)
     }
 
     /// Values looked up in the static tensor field stay in caches, so its stages over samples are not included.

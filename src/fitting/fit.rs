@@ -53,6 +53,12 @@ pub trait Method: Sync {
         Ok(None)
     }
 
+    /// Estimates the memory of a run, from the number and the size of its images, on a device whose buffers have at most `max_buffer`
+    /// bytes; none where the method has no estimate.
+    fn memory(&self, _config: &Config, _dataset: &Dataset, _max_buffer: u64) -> Option<MemoryEstimate> {
+        None
+    }
+
     /// Returns the rays of an iteration; 0 for a method that draws whole images.
     fn rays_per_iteration(&self, config: &Config) -> u32;
 
@@ -72,6 +78,18 @@ pub trait Method: Sync {
     fn boxes_hold_all_rays(&self) -> bool {
         false
     }
+}
+
+/// Estimate of the largest memory of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MemoryEstimate {
+    /// Memory of the host, bytes.
+    pub host_bytes: u64,
+    /// Memory of the device, bytes.
+    pub device_bytes: u64,
+    /// Both at once where the memory of the device is that of the host, bytes; less than the sum, because they are largest at
+    /// different times.
+    pub together_bytes: u64,
 }
 
 /// Views whose calibrated geometry is to be adjusted.
@@ -103,6 +121,8 @@ pub struct MadeGaussians {
     pub gaussians: DynamicGaussians,
     /// Loss of each iteration.
     pub losses: Vec<f64>,
+    /// Findings about the data, for the user.
+    pub findings: Vec<String>,
     /// Fingerprint of the data and the settings of the fit.
     pub fingerprint: String,
 }
@@ -318,6 +338,11 @@ pub trait Fit: Send {
     /// Returns, once, the settings that make steps smaller from now on, when the losses that follow are those of another objective.
     fn new_objective(&mut self) -> Option<&'static str> {
         None
+    }
+
+    /// Returns findings about the data since the last call, as sentences for the user.
+    fn take_findings(&mut self) -> Vec<String> {
+        Vec::new()
     }
 
     /// Returns the field as it is drawn now; without its numbers where these are on the device.

@@ -17,6 +17,9 @@ pub struct Particles {
     pub second: Vec<[f32; 12]>,
 }
 
+/// Bytes of the moments of a splat: two vec4.
+pub const MOMENTS_BYTES: u64 = 32;
+
 buffer_set! {
     /// Gaussians on the device, and the values that an iteration computes for each.
     pub struct ParticleBuffers {
@@ -74,12 +77,21 @@ impl Particles {
             gaussian_gradient: new(Binding::gaussian_gradient, 48 * n)?,
             splats: new(Binding::splats, size_of::<Splat>() as u64 * n_splats)?,
             image_of_splat: new(Binding::image_of_splat, 4 * n_splats)?,
-            splat_moments: new(Binding::splat_moments, 32 * n_splats)?,
+            splat_moments: new(Binding::splat_moments, MOMENTS_BYTES * n_splats)?,
         })
     }
 }
 
 impl ParticleBuffers {
+    /// Returns the same buffers with other moments, which have room for `n_splats`.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::OutOfMemory`] naming the buffer.
+    pub fn with_moments(&self, gpu: &Gpu, n_splats: u64) -> Result<ParticleBuffers> {
+        let splat_moments = gpu.buffer("splat_moments of a part", MOMENTS_BYTES * n_splats, Memory::Device)?;
+        Ok(ParticleBuffers { splat_moments, ..self.clone() })
+    }
+
     /// Reads the first `n` Gaussians back.
     ///
     /// # Errors

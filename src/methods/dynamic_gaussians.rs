@@ -3,6 +3,7 @@
 
 pub mod adjust;
 pub mod carried;
+pub mod catheter;
 pub mod coarse;
 pub mod data;
 pub mod deformable;
@@ -10,6 +11,7 @@ pub(crate) mod fine;
 pub mod fit;
 pub mod lengths;
 mod made;
+mod memory;
 pub mod per_phase;
 mod pruning;
 pub mod remainder;
@@ -18,6 +20,7 @@ pub mod seeds;
 #[cfg(feature = "diagnostics")]
 pub mod selftest;
 pub mod setup;
+pub mod shared_images;
 pub mod soft_hull;
 pub mod stages;
 pub mod start;
@@ -36,7 +39,8 @@ use crate::error::Result;
 use crate::fields::data::lower_rates;
 use crate::fields::state;
 use crate::fitting::fit::{
-    AdjustTask, AdjustedFit, Fit, FitData, FitStart, Method, Observe, PlannedFit, SavedAt, SavedFit, TimedFit,
+    AdjustTask, AdjustedFit, Fit, FitData, FitStart, MemoryEstimate, Method, Observe, PlannedFit, SavedAt, SavedFit,
+    TimedFit,
 };
 use crate::gaussians::blobs::BlobKernels;
 use crate::gaussians::field::SMALLER_STEPS;
@@ -80,6 +84,11 @@ impl Method for DynamicGaussiansMethod {
         let mut saved = state::read(sections, config, at, file)?;
         saved.field.gaussians = Some(tensors::read_section(sections, file, at.n_phases)?);
         Ok(saved)
+    }
+
+    fn memory(&self, config: &Config, dataset: &Dataset, max_buffer: u64) -> Option<MemoryEstimate> {
+        // Sets per phase are fitted with all pixels from the start.
+        (config.gaussians.form != GaussianForm::Phase).then(|| memory::estimate(dataset, max_buffer))
     }
 
     fn rays_per_iteration(&self, config: &Config) -> u32 {

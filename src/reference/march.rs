@@ -52,11 +52,12 @@ pub fn batch(plan: &FieldData, step: u32) -> Vec<Ray> {
 /// Returns a training ray by its id.
 pub fn ray(plan: &FieldData, id: u32) -> Ray {
     let s = &plan.setup;
-    let frame = plan.frames[(id / s.n_pixels) as usize];
+    let index = (id / s.n_pixels) as usize;
+    let frame = plan.frames[index];
     let view = plan.views[frame.view as usize];
     let pixel = id % s.n_pixels;
     let (i, j) = (f64::from(pixel % s.image_width), f64::from(pixel / s.image_width));
-    let target = f64::from(plan.images[(frame.image_offset + pixel) as usize]);
+    let target = f64::from(plan.images[index][pixel as usize]);
     let beyond_share = f64::from(frame.beyond_share);
     let [low, high] = plan.backgrounds[(frame.background_offset + pixel) as usize];
     let v = |a: [f32; 4]| DVec3::new(a[0].into(), a[1].into(), a[2].into());

@@ -24,6 +24,15 @@ pub enum Event {
         /// Decisions about data and device.
         notes: Vec<String>,
     },
+    /// Estimate of the memory of a new run, before its data are analysed; not a line of `metrics.jsonl`.
+    Memory {
+        /// Memory of the host, MiB.
+        host_mib: u64,
+        /// Memory of the device, MiB.
+        device_mib: u64,
+        /// Both at once where the memory of the device is that of the host, MiB.
+        together_mib: u64,
+    },
     /// Comparison of the training views as stated, which a new run makes where two of them show two phases. It follows
     /// [`Event::Started`], or comes alone where the run cannot start.
     Checked {
@@ -71,6 +80,13 @@ pub enum Event {
         loss: f64,
         /// The loss divided by the first one of this start.
         ratio: f64,
+    },
+    /// Finding about the data that the fit has led to, such as a catheter in the dynamic field.
+    Found {
+        /// Iterations done.
+        step: u32,
+        /// The finding, in words.
+        note: String,
     },
     /// Metrics on a selection of unseen images.
     Validation {

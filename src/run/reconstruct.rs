@@ -73,6 +73,15 @@ pub fn reconstruct(
         files::create_directory(options.run)?;
         files::write_atomic(&options.run.join(CONFIG), config.to_toml()?.as_bytes())?;
     }
+    let max_buffer = u64::from(gpu.info().max_storage_buffer_range);
+    if let Some(memory) = methods::of(config).memory(config, dataset, max_buffer) {
+        let mib = |bytes: u64| bytes >> 20;
+        observe(&Event::Memory {
+            host_mib: mib(memory.host_bytes),
+            device_mib: mib(memory.device_bytes),
+            together_mib: mib(memory.together_bytes),
+        });
+    }
     let checked = if options.resume { None } else { checked(dataset) };
     let Calibrated { dataset, carried, calibration, made } = calibrated(gpu, config, dataset, options, observe)?;
     let dataset = &dataset;
@@ -287,6 +296,10 @@ impl<'a> Loop<'a> {
     fn report(&mut self, progress: Vec<Progress>) -> Result<()> {
         if let Some(LargeLoss { step, loss, ratio }) = self.training.trainer_mut().take_large_loss() {
             (self.tell)(Event::LargeLoss { step, loss, ratio })?;
+        }
+        let step = self.training.trainer().step();
+        for note in self.training.trainer_mut().take_findings() {
+            (self.tell)(Event::Found { step, note })?;
         }
         for p in progress {
             if p.loss.step.is_multiple_of(REPORT_EVERY) || p.loss.step == self.end {

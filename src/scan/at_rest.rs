@@ -57,7 +57,7 @@ pub(crate) fn add_appearance_without_vessels(views: &[View], frames: &mut Vec<Fr
         let frame = Frame {
             name: format!("{}-without-vessels", shown[0].name),
             phase: 1,
-            integrals: background.values,
+            integrals: background.values.into(),
             mask: None,
             ..shown[0].clone()
         };

@@ -51,8 +51,8 @@ pub(crate) fn onto_canvas(views: &[View], frames: &mut [Frame]) -> Result<Option
     }
     for frame in frames {
         let size = views[frame.view].size;
-        let image = Image { width: size[0], height: size[1], values: std::mem::take(&mut frame.integrals) };
-        frame.integrals = continued(image, canvas).values;
+        let image = Image { width: size[0], height: size[1], values: std::mem::take(&mut frame.integrals).into_vec() };
+        frame.integrals = continued(image, canvas).values.into();
         frame.mask = frame.mask.take().map(|mask| framed(&mask, size, canvas, false));
     }
     Ok(Some(canvas))
@@ -77,7 +77,7 @@ impl Dataset {
         }
         Cow::Owned(Frame {
             name: frame.name.clone(),
-            integrals: self.own(frame.view, &frame.integrals).into_owned(),
+            integrals: self.own(frame.view, &frame.integrals).into_owned().into(),
             mask: frame.mask.as_ref().map(|mask| self.own(frame.view, mask).into_owned()),
             ..*frame
         })

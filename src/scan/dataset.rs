@@ -2,6 +2,7 @@
 
 use crate::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays, is_at_rest};
 use crate::scan::gating::BeatTime;
+use crate::scan::pixels::Pixels;
 use glam::DVec3;
 use serde::{Deserialize, Serialize, Serializer};
 use std::collections::BTreeMap;
@@ -149,7 +150,7 @@ pub struct Frame {
     /// Training or validation.
     pub split: Split,
     /// Line integrals in row-major order; in a dataset, on the canvas of all images (see [`crate::scan::canvas`]).
-    pub integrals: Vec<f32>,
+    pub integrals: Pixels,
     /// Vessel mask, where known; false outside the image's own size.
     pub mask: Option<Vec<bool>>,
     /// Displacement of the heart from its mean position by breathing, along (posterior, left, superior), mm.

@@ -141,7 +141,7 @@ mod tests {
     }
 
     fn hidden_of(frames: &[Frame]) -> Vec<bool> {
-        hidden(&frames.iter().map(|frame| Cow::from(&frame.integrals)).collect::<Vec<_>>(), WIDTH, HEIGHT)
+        hidden(&frames.iter().map(|frame| Cow::Borrowed(frame.integrals.as_slice())).collect::<Vec<_>>(), WIDTH, HEIGHT)
     }
 
     /// A chest with a moving vessel, and dark columns from `first` on.

@@ -280,7 +280,7 @@ pub fn write(
     for frame in &dataset.frames {
         let view = &dataset.views[frame.view];
         let (own, [width, height]) = (dataset.own_frame(frame).into_owned(), view.size);
-        let image = Image { width, height, values: own.integrals };
+        let image = Image { width, height, values: own.integrals.into_vec() };
         writer.frame(&view.geometry, frame.split, frame.view, frame.beat_time(), &image, own.mask.as_deref())?;
         writer.corrected(frame.heart_shift_mm, stated(frame.view).as_ref())?;
     }

@@ -58,7 +58,7 @@ pub fn twin_residuals(targets: &Targets, setup: &GaussianSetup, images: &[f64]) 
     for (i, image) in images.chunks(n).enumerate() {
         let part = |all: &'_ [f32]| all[i * n..][..n].to_vec();
         let (value, gradient) =
-            reference::residual(setup, image, &part(&targets.low), &part(&targets.high), &part(&targets.weight));
+            reference::residual(setup, image, &part(&targets.low), &part(&targets.high), targets.weight.image(i));
         loss += value;
         gradients.push(gradient);
     }

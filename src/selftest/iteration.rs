@@ -57,7 +57,7 @@ impl Case {
         let mut plan = Plan::new(&small_config(self.preset, &settings)?, dataset)?;
         if self.settings.iter().any(|setting| setting.starts_with("dynamic.min_slope")) {
             // Every ray asks for more attenuation.
-            plan.data_mut::<FieldData>()?.images.iter_mut().for_each(|value| *value += 1.0);
+            plan.data_mut::<FieldData>()?.images.iter_mut().flatten().for_each(|value| *value += 1.0);
         }
         Ok(plan)
     }

@@ -8,6 +8,7 @@ use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry, ViewRays};
 use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
 use crate::methods::dynamic_gaussians::lengths::Lengths;
+use crate::methods::dynamic_gaussians::shared_images::SharedImages;
 use crate::methods::dynamic_gaussians::targets::{PossibleVessel, Targets};
 use crate::methods::dynamic_gaussians::twin::DeformableParams;
 use crate::random::{STREAM_JITTER, normal};
@@ -181,13 +182,13 @@ pub fn targets(width: usize, height: usize, n_phases: usize) -> Result<Targets> 
         n_images,
         low: all.clone().map(|i| wave(i, 0.37) - 0.1).collect(),
         high: all.clone().map(|i| wave(i, 0.37) - 0.1 + 0.3 * wave(i, 0.71)).collect(),
-        weight: all.clone().map(|i| 0.5 + 0.5 * wave(i, 0.13)).collect(),
-        noise: vec![0.01; n_images * width * height],
+        weight: SharedImages::of_each(all.clone().map(|i| 0.5 + 0.5 * wave(i, 0.13)).collect(), width * height),
+        noise: SharedImages::of_each(vec![0.01; n_images * width * height], width * height),
         contrast: vec![1.0; n_images],
         lengths: Lengths { factor: 1.0, smoothing: 1.0 },
         rest_phase: 0,
         images: all.clone().map(|i| 1.0 + wave(i, 0.37)).collect(),
-        max: all.clone().map(|i| 1.0 + wave(i, 0.37)).collect(),
+        max: Some(all.clone().map(|i| 1.0 + wave(i, 0.37)).collect()),
         places: vec![Vec::new(); n_phases],
         cell: 1.0,
     })

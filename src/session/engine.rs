@@ -421,6 +421,7 @@ impl Shared {
         if let Some(large) = trainer.take_large_loss() {
             tracing::warn!("{large}");
         }
+        trainer.take_findings().iter().for_each(|finding| tracing::info!("{finding}"));
         self.step.store(trainer.submitted(), Ordering::Release);
         if !trainer.shows_earlier() {
             lock(&self.published).frames = frames;

@@ -147,7 +147,7 @@ impl Inbox {
             view,
             phase: if let FrameTime::Phase(phase) = new.moment { phase } else { 0 },
             split: new.split,
-            integrals: new.integrals,
+            integrals: new.integrals.into(),
             mask: new.mask,
             after_phase: 0.0,
             heart_shift_mm: [0.0; 3],

@@ -259,6 +259,11 @@ impl Trainer {
         self.large_loss.take()
     }
 
+    /// Returns findings about the data since the last call, for the user.
+    pub fn take_findings(&mut self) -> Vec<String> {
+        self.fit.take_findings()
+    }
+
     /// Runs one iteration with a timestamp around each pass.
     ///
     /// # Errors
@@ -343,7 +348,7 @@ mod tests {
             view: 0,
             phase,
             split,
-            integrals: vec![value, 1.0, 2.0, 3.0],
+            integrals: vec![value, 1.0, 2.0, 3.0].into(),
             mask: None,
             after_phase: 0.0,
             heart_shift_mm: [0.0; 3],

@@ -55,15 +55,18 @@ fn bridges_from(forest: &Forest, end: usize, resolution_mm: f64) -> Vec<Bridge> 
     (0..forest.nodes.len()).filter_map(bridge).collect()
 }
 
-/// Prunes branches with an end that reach less than `least_mm` beyond the lumen of the vessel they leave, the shortest
-/// first.
+/// Share of the radius of a vessel that a branch must reach beyond its lumen: a bump of a thick vessel is no branch.
+const BUMP: f64 = 0.5;
+
+/// Prunes branches with an end that reach less than `least_mm` beyond the lumen of the vessel they leave, or less than a share of its
+/// radius, the shortest first.
 pub(super) fn prune_spurs(forest: &mut Forest, least_mm: f64) {
     loop {
         let spurs = forest.ends().filter_map(|end| {
             let chain = forest.chain(end, *forest.nodes[end].links.first()?);
             let leaves = &forest.nodes[*chain.last()?];
             let reach_mm = forest.length_mm(&chain) - leaves.inside_mm;
-            (leaves.links.len() > 2 && reach_mm < least_mm).then_some((reach_mm, chain))
+            (leaves.links.len() > 2 && reach_mm < least_mm.max(BUMP * leaves.inside_mm)).then_some((reach_mm, chain))
         });
         match spurs.min_by(|a, b| a.0.total_cmp(&b.0)) {
             Some((_, mut chain)) => {

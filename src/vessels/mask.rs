@@ -24,6 +24,11 @@ impl Mask {
         self.inside.iter().enumerate().filter(|(_, inside)| **inside).map(|(index, _)| index)
     }
 
+    /// Returns the voxels that do not belong to the set.
+    pub fn complement(&self) -> Mask {
+        Mask { inside: self.inside.iter().map(|inside| !inside).collect(), ..*self }
+    }
+
     /// Returns the set with a border of one outside voxel, in which each voxel has all its neighbours.
     pub(super) fn framed(&self) -> Framed {
         let size = self.size.map(|n| n + 2);

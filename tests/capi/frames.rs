@@ -282,7 +282,7 @@ fn appearance_without_vessels() -> Vec<Vec<f32>> {
         "vessel_attenuation_per_mm": 0.01, "frames": [frame(0), frame(1), frame(2)]});
     std::fs::write(directory.path().join("dataset.json"), manifest.to_string()).unwrap();
     let dataset = Dataset::open(directory.path()).unwrap();
-    let estimated: Vec<_> = dataset.frames.iter().filter(|f| f.phase == 1).map(|f| f.integrals.clone()).collect();
+    let estimated: Vec<_> = dataset.frames.iter().filter(|f| f.phase == 1).map(|f| f.integrals.to_vec()).collect();
     assert!(estimated.len() == 3 && estimated.iter().all(|f| *f != image));
     estimated
 }

@@ -62,8 +62,10 @@ fn a_whole_life() {
     let run = directory.path().join("run");
     let lines = ok(&[&["train", text(&data), "-o", text(&run), "--json", "--stop-at", "20"], SHORT].concat());
     let events: Vec<Value> = lines.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
-    // Views are adjusted before a run starts.
-    let events: Vec<Value> = events.into_iter().skip_while(|e| e["event"] == "adjusting").collect();
+    // The memory is stated, and views are adjusted, before a run starts.
+    assert!(events[0]["event"] == "memory" && events[0]["host_mib"].as_u64() > Some(100), "{}", events[0]);
+    let events: Vec<Value> =
+        events.into_iter().skip_while(|e| e["event"] == "memory" || e["event"] == "adjusting").collect();
     let kinds: Vec<_> = events.iter().map(|e| e["event"].as_str().unwrap()).collect();
     assert_eq!(kinds[0], "started");
     assert!(kinds.contains(&"validation") && kinds.contains(&"saved"));
@@ -266,7 +268,7 @@ fn volumes_are_projected_in_every_format() {
     ] {
         let out = directory.path().join(name);
         ok(&[&["project", text(file), text(file), "--out", text(&out)], &common[..], extra].concat());
-        images.push(nertca_vk::scan::dataset::Dataset::open(&out).unwrap().frames[0].integrals.clone());
+        images.push(nertca_vk::scan::dataset::Dataset::open(&out).unwrap().frames[0].integrals.to_vec());
     }
     assert_eq!(images[0], images[1]);
     assert_eq!(images[0], images[2]);

@@ -157,7 +157,7 @@ fn the_page_of_a_run_draws_the_tree_over_its_angiograms() {
         let frames = frames.map(|frame| {
             let rays = dataset.heart_rays(frame);
             let lines: Vec<_> = lines(&tree, f64::from(frame.phase)).iter().map(|line| seen(&rays, line)).collect();
-            json!({ "phase": frame.phase, "lines": lines, "integrals": frame.integrals })
+            json!({ "phase": frame.phase, "lines": lines, "integrals": *frame.integrals })
         });
         frames.collect::<Vec<_>>()
     });

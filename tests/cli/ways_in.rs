@@ -340,7 +340,7 @@ fn an_object_at_rest_comes_out_with_one_phase() {
     // The appearance without vessels is the water alone: at most a tenth of the vessel's own line integral remains.
     let of = |view: usize, phase: u32| {
         let frame = read.training().iter().find(|f| (f.view, f.phase) == (view, phase)).unwrap();
-        (frame.integrals.clone(), frame.mask.clone())
+        (frame.integrals.to_vec(), frame.mask.clone())
     };
     for view in read.training_views() {
         let ((shown, mask), (without, _)) = (of(view, 0), of(view, 1));

@@ -125,7 +125,7 @@ impl Studio {
                     view: v,
                     phase: t,
                     split: *split,
-                    integrals,
+                    integrals: integrals.into(),
                     mask,
                     after_phase: 0.0,
                     heart_shift_mm: [0.0; 3],

@@ -23,7 +23,7 @@ pub fn dataset(angles: &[[f64; 2]], [width, height]: [usize; 2], image: impl Fn(
         view: v,
         phase: 0,
         split: Split::Train,
-        integrals: image(v, view),
+        integrals: image(v, view).into(),
         mask: None,
         after_phase: 0.0,
         heart_shift_mm: [0.0; 3],

@@ -7,19 +7,21 @@ use crate::shim;
 use crate::shim::Poor;
 use ash::vk;
 use nertca_vk::bench::peaks::peaks;
-use nertca_vk::config::Preset;
+use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
+use nertca_vk::gaussians::particles::Particles;
 use nertca_vk::gpu::device::{Adoption, DeviceOptions, Gpu};
 use nertca_vk::gpu::record::{Groups, Recording};
 use nertca_vk::kernels::dispatch::{Binding, dispatch};
 use nertca_vk::kernels::push;
 use nertca_vk::kernels::stages::{Build, Stage};
 use nertca_vk::kernels::tuning::Tuning;
+use nertca_vk::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use nertca_vk::methods::dynamic_gaussians::selftest as deformable;
 use nertca_vk::methods::sax_nerf::selftest as sax;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::selftest::{drawing, gaussians, repeats};
+use nertca_vk::selftest::{drawing, gaussians, problems, repeats};
 use nertca_vk::train::trainer::Trainer;
 
 /// Minimum requirements of Vulkan 1.2, except for the storage buffers of a kernel.
@@ -63,6 +65,66 @@ fn the_least_of_devices_computes_what_others_do() {
     let peaks = peaks(&gpu).unwrap();
     assert!(!peaks.by_timestamps && peaks.f32_tflops > 0.0 && peaks.copy_gb_per_s > 0.0);
     drop(trainer);
+    expect_silence(gpu);
+}
+
+/// A device with all features, whose buffers have at most `MAX_BUFFER` bytes.
+const SMALL_BUFFERS: Poor = Poor {
+    extensions: true,
+    features: true,
+    timestamps: true,
+    limits: |limits| limits.max_storage_buffer_range = MAX_BUFFER,
+    free_memory: None,
+};
+const MAX_BUFFER: u32 = 256 << 10;
+/// Side of images, of which such a buffer holds sixteen.
+const SIDE: usize = 64;
+
+#[test]
+fn images_larger_than_a_buffer_are_fitted_alike() {
+    const ITERATIONS: u32 = 44;
+    let targets = problems::targets(SIDE, SIDE, 10).unwrap();
+    assert!(targets.n_images > 16, "{} images", targets.n_images);
+    let rows = problems::random_gaussians(60, 1, 20.0, 4);
+    // The background is renewed after 40 iterations.
+    let config = Config::preset(Preset::Fast);
+    let fitted = |gpu: &Gpu| {
+        let particles = Particles::fresh(rows.clone());
+        let mut trainer = DeformableTrainer::with(gpu, targets.clone(), &config, &particles).unwrap();
+        let mut losses = Vec::new();
+        while trainer.step() < ITERATIONS {
+            losses.extend(trainer.advance(ITERATIONS).unwrap());
+        }
+        (losses, trainer.deformable().unwrap(), trainer.images().unwrap())
+    };
+    let whole = fitted(&common::gpu());
+    let gpu = open(SMALL_BUFFERS).unwrap();
+    assert_eq!(gpu.info().max_storage_buffer_range, MAX_BUFFER);
+    let parts = fitted(&gpu);
+    assert_eq!(parts.0, whole.0, "losses");
+    assert_eq!(parts.1, whole.1, "the deformable set");
+    assert_eq!(parts.2, whole.2, "its images");
+    expect_silence(gpu);
+}
+
+#[test]
+fn rays_of_images_larger_than_a_buffer_are_drawn_alike() {
+    const STEPS: u32 = 8;
+    // Seventeen images: a buffer holds all but one.
+    let dataset = problems::small_dataset(SIDE, SIDE, 6).unwrap();
+    assert!(dataset.training().len() > 16, "{} images", dataset.training().len());
+    let config = small_config("fast-mlp", &["occupancy.enabled=false"]);
+    let trained = |gpu: &Gpu| {
+        let plan = Plan::new(&config, &dataset).unwrap();
+        let mut trainer = Trainer::new(gpu, plan, &dataset, tuning(gpu)).unwrap();
+        while trainer.step() < STEPS {
+            trainer.advance(STEPS).unwrap();
+        }
+        trainer.checkpoint().unwrap().model.params
+    };
+    let whole = trained(&common::gpu());
+    let gpu = open(SMALL_BUFFERS).unwrap();
+    assert_eq!(trained(&gpu), whole);
     expect_silence(gpu);
 }
 

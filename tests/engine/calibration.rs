@@ -228,7 +228,7 @@ fn a_session_tells_how_it_sees_its_frames() {
             split: f.split,
             width: shot.dataset.width,
             height: shot.dataset.height,
-            integrals: f.integrals.clone(),
+            integrals: f.integrals.to_vec(),
             mask: None,
         };
         session.add_frame(new).unwrap();

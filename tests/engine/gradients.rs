@@ -33,7 +33,7 @@ fn a_sleeping_field_is_called_back() {
         let mut plan = plan("fast-mlp", &[asleep[0], asleep[1], &slope]);
         if !more {
             // No ray requires positive attenuation.
-            plan.images.iter_mut().for_each(|value| *value = -1.0);
+            plan.images.iter_mut().flatten().for_each(|value| *value = -1.0);
         }
         let rays = march::batch(&plan, 0);
         let (_, gradient) = step::loss_and_gradient(&plan, &start(&plan), 0, &rays, Precision::Exact);

@@ -67,7 +67,7 @@ fn add(session: &Session, dataset: &Dataset, wanted: impl Fn(&Frame) -> bool) {
             split: f.split,
             width: dataset.width,
             height: dataset.height,
-            integrals: f.integrals.clone(),
+            integrals: f.integrals.to_vec(),
             mask: None,
         };
         session.add_frame(new).unwrap();

@@ -56,7 +56,7 @@ fn who_waited_for_the_end_may_start_and_train_at_once() {
             split: frame.split,
             width: dataset.width,
             height: dataset.height,
-            integrals: frame.integrals.clone(),
+            integrals: frame.integrals.to_vec(),
             mask: None,
         };
         session.add_frame(new).unwrap();

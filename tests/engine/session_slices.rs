@@ -34,7 +34,7 @@ fn trained(gpu: &Gpu, dataset: &Dataset) -> Arc<Session> {
                 split,
                 width: dataset.width,
                 height: dataset.height,
-                integrals: frame.integrals.clone(),
+                integrals: frame.integrals.to_vec(),
                 mask: None,
             };
             session.add_frame(new).unwrap();

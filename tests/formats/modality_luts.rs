@@ -84,7 +84,7 @@ fn integrals(file: &Path, directory: &Path) -> Vec<f32> {
     let out = directory.join("data");
     let _ = std::fs::remove_dir_all(&out);
     import_dicom(&[file.to_path_buf()], &options, &out).unwrap();
-    Dataset::open(&out).unwrap().frames[0].integrals.clone()
+    Dataset::open(&out).unwrap().frames[0].integrals.to_vec()
 }
 
 #[track_caller]

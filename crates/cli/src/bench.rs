@@ -133,6 +133,16 @@ fn write_json(file: &Path, value: &impl serde::Serialize) -> Result<()> {
 
 /// Performs a dry run, and prints a line about the events it covered.
 fn dry_run_of(global: &GlobalOptions, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<DryRun> {
+    let max_buffer = u64::from(gpu.info().max_storage_buffer_range);
+    if let Some(memory) = methods::of(config).memory(config, dataset, max_buffer) {
+        let mib = |bytes: u64| bytes >> 20;
+        out!(
+            "memory of the whole run: about {} MiB of the host and {} MiB of the device, or {} MiB where they share it",
+            mib(memory.host_bytes),
+            mib(memory.device_bytes),
+            mib(memory.together_bytes)
+        );
+    }
     let done = dry_run(gpu, config, dataset, &global.training_tuning(gpu, config, dataset)?)?;
     out!(
         "dry run: {} iterations around the schedule's events at {:?} in {:.1} s; the last loss is {:.3e}",

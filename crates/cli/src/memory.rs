@@ -1,4 +1,5 @@
-//! Memory that a training takes, asked for before it begins: drivers crash where they are refused memory later.
+//! Memory that a training takes, asked for before it begins: drivers crash where they are refused memory later; and memory that it has
+//! freed, returned to the system.
 
 use nertca_vk::error::{Error, Result};
 
@@ -21,4 +22,14 @@ pub fn room_for_training() -> Result<()> {
         may_pass: true,
         instead: "a higher limit of the process (ulimit -v)",
     })
+}
+
+/// Returns memory that was freed to the system, where the C library keeps it otherwise: images that a run has analysed before it starts leave
+/// gaps that later, larger ones do not fit into.
+pub fn return_freed() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: the function may be called at any time, from any thread; it changes no memory that is in use.
+    unsafe {
+        libc::malloc_trim(0);
+    }
 }

@@ -68,6 +68,12 @@ pub fn show_progress() -> impl FnMut(&Event) {
             say(&bar, format!("{device}: {parameters} parameters"));
             notes.iter().for_each(|n| say(&bar, format!("- {n}")));
         }
+        Event::Memory { host_mib, device_mib, together_mib } => say(
+            &bar,
+            format!(
+                "memory: about {host_mib} MiB of the host and {device_mib} MiB of the device, or {together_mib} MiB where they share it"
+            ),
+        ),
         Event::Checked { conclusion, check, .. } => {
             let warning = if check.faulty() { "warning: " } else { "- " };
             say(&bar, format!("{warning}{conclusion}"));
@@ -92,6 +98,7 @@ pub fn show_progress() -> impl FnMut(&Event) {
         Event::LargeLoss { step, loss, ratio } => {
             say(&bar, format!("warning: {}", LargeLoss { step: *step, loss: *loss, ratio: *ratio }));
         }
+        Event::Found { note, .. } => say(&bar, format!("- {note}")),
         Event::Validation { step, train_s, dice_dynamic, psnr, ssim, .. } => {
             let dice = dice_dynamic.map_or("-".into(), |d| format!("{d:.3}"));
             say(&bar, format!("{step:6} iterations, {train_s:6.1} s: Dice {dice}  PSNR {psnr:.2} dB  SSIM {ssim:.3}"));

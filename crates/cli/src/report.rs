@@ -80,6 +80,8 @@ impl Report<'_> {
         } else {
             facts.extend(tuning.reasons.iter().map(|reason| ("note".to_owned(), reason.clone())));
         }
+        let found = latest("found").and_then(|line| line["note"].as_str());
+        facts.extend(found.map(|note| ("found".to_owned(), note.to_owned())));
         if let Some(s) = latest("finished").and_then(|line| line["train_s"].as_f64()) {
             facts.push(("training".into(), format!("{s:.1} s; the paper: 2220 s on an RTX A5000")));
         }

@@ -1,7 +1,7 @@
 //! `train`: performs a run and writes its report.
 
 use super::eval::print_table;
-use super::memory::room_for_training;
+use super::memory::{return_freed, room_for_training};
 use super::options::{ConfigArgs, GlobalOptions};
 use super::progress::{print_json, show_progress, stop_flag};
 use super::report::Report;
@@ -109,7 +109,13 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     let (config, resume) = if args.resume { resumed(run)? } else { (config, false) };
     let tuning = global.training_tuning(&gpu, &config, &dataset)?;
     let options = RunOptions { tuning: &tuning, run, resume, stop_at: args.stop_at, cancel: &cancel };
-    let mut observer: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
+    let mut show: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
+    let mut observer = |event: &Event| {
+        if let Event::Started { .. } = event {
+            return_freed();
+        }
+        show(event);
+    };
     reconstruct(&gpu, &config, &dataset, &options, &mut observer)?;
     let dataset = as_trained(dataset, run)?;
     let report = run.join("report");
@@ -131,7 +137,7 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
         write_scores(&report, &scores)?;
         evaluation = Some(scores);
     }
-    drop(observer);
+    drop(show);
     let tree = if args.tree {
         tree_of_page(global, &gpu, &model, &cancel, run, &mut warnings)?
     } else {

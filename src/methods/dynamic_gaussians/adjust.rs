@@ -172,11 +172,13 @@ impl Adjuster<'_> {
 
     /// Fits with the settings of the run; returns the misfit and the fit.
     fn compared(&self, dataset: &Dataset) -> Result<Option<(f64, MadeGaussians)>> {
-        let Some(Fitted { trainer, losses, fingerprint }) = self.fit(dataset, self.config, Pruning::On)? else {
+        let Some(Fitted { mut trainer, losses, fingerprint }) = self.fit(dataset, self.config, Pruning::On)? else {
             return Ok(None);
         };
         let gaussians = DynamicGaussians::Deformable(trainer.deformable()?);
-        Ok(Some((misfit(trainer.targets(), &trainer.images()?), MadeGaussians { gaussians, losses, fingerprint })))
+        let misfit = misfit(trainer.targets(), &trainer.images()?);
+        let findings = trainer.take_catheter().into_iter().collect();
+        Ok(Some((misfit, MadeGaussians { gaussians, losses, findings, fingerprint })))
     }
 
     /// Fits a deformable set; none where the data do not ask for one.

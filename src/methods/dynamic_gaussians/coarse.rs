@@ -52,10 +52,12 @@ impl Targets {
         let n = (factor * factor) as f32;
         let mean = |values: &[f32]| bins.of(values, self.n_pixels(), |values| values.sum::<f32>() / n);
         // Noise of neighbouring pixels is taken as independent.
-        let noise = bins.of(&self.noise, self.n_pixels(), |values| values.map(|s| s * s).sum::<f32>().sqrt() / n);
-        let shown = bins.of(&self.weight, self.n_pixels(), |values| values.fold(f32::INFINITY, f32::min));
-        let weight = |(shown, noise): (&f32, &f32)| match *shown > 0.0 {
-            true => weight_of_noise((*noise).into(), noise_scale),
+        let root = |values: &mut dyn Iterator<Item = f32>| values.map(|s| s * s).sum::<f32>().sqrt() / n;
+        let noise = self.noise.map(width * height, |noise| bins.of(noise, self.n_pixels(), root));
+        let min = |values: &mut dyn Iterator<Item = f32>| values.fold(f32::INFINITY, f32::min);
+        let shown = self.weight.map(width * height, |weight| bins.of(weight, self.n_pixels(), min));
+        let weight = |shown: f32, noise: f32| match shown > 0.0 {
+            true => weight_of_noise(noise.into(), noise_scale),
             false => 0.0,
         };
         let scale = factor as f64;
@@ -68,10 +70,10 @@ impl Targets {
             image_of: self.image_of.clone(),
             contrast: self.contrast.clone(),
             images: mean(&self.images),
-            max: mean(&self.max),
+            max: self.max.as_deref().map(mean),
             low: mean(&self.low),
             high: mean(&self.high),
-            weight: shown.iter().zip(&noise).map(weight).collect(),
+            weight: shown.zip(&noise, weight),
             noise,
             lengths: Lengths { factor: self.lengths.factor / scale, ..self.lengths },
             places: self.places.iter().map(|places| places.iter().map(place).collect()).collect(),
@@ -86,6 +88,7 @@ mod tests {
     use super::*;
     use crate::gaussians::view::SplatView;
     use crate::geometry::{CArm, Geometry};
+    use crate::methods::dynamic_gaussians::shared_images::SharedImages;
     use glam::DVec3;
 
     const WIDTH: usize = 7;
@@ -115,13 +118,13 @@ mod tests {
             views: vec![SplatView { after_phase: 0.25, ..SplatView::new(&rays, units) }; 2],
             image_of: vec![Some(0), Some(1)],
             n_images: 2,
-            max: images.iter().map(|v| v + 3.0).collect(),
+            max: Some(images.iter().map(|v| v + 3.0).collect()),
             low: images.iter().map(|v| v - 1.0).collect(),
             high: images.iter().map(|v| v + 2.0).collect(),
-            noise: vec![0.1; images.len()],
+            noise: SharedImages::of_each(vec![0.1; images.len()], WIDTH * HEIGHT),
             contrast: vec![1.0, 0.9],
             images,
-            weight,
+            weight: SharedImages::of_each(weight, WIDTH * HEIGHT),
             lengths: Lengths { factor: 4.0, smoothing: 1.2 },
             rest_phase: 1,
             places: vec![vec![PossibleVessel { position: DVec3::new(4.0, 6.0, -8.0), evidence: 9.0 }], Vec::new()],
@@ -135,8 +138,8 @@ mod tests {
         assert_eq!((coarse.width, coarse.height, coarse.n_images), (3, 2, 2), "the last column is left out");
         // Pixels 0, 1, 7 and 8 have the mean 4; pixels of the second image are 28 higher, of the second row 14.
         assert_eq!(coarse.images, [4.0, 6.0, 8.0, 18.0, 20.0, 22.0, 32.0, 34.0, 36.0, 46.0, 48.0, 50.0]);
-        assert_eq!((coarse.low[1], coarse.high[1], coarse.max[1]), (5.0, 8.0, 9.0));
-        assert!(coarse.noise.iter().all(|s| (s - 0.05).abs() < 1e-7), "half the noise");
+        assert_eq!((coarse.low[1], coarse.high[1], coarse.max.as_ref().unwrap()[1]), (5.0, 8.0, 9.0));
+        assert!((0..12).all(|p| (coarse.noise[p] - 0.05).abs() < 1e-7), "half the noise");
         let hidden: Vec<usize> = (0..12).filter(|p| coarse.weight[*p] == 0.0).collect();
         assert_eq!(hidden, [1], "one of its pixels is hidden");
         assert!((coarse.weight[0] - 0.5f32.sqrt()).abs() < 1e-6, "the weight of its own noise");

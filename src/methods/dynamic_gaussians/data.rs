@@ -60,7 +60,9 @@ pub(super) const SOFT_HULL_CELLS: usize = 112;
 
 /// Computes where vessels may be, and the targets that Gaussians are fitted to.
 fn hull_and_targets(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<(Hull, Targets)> {
-    let soft = SoftMotion::new(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
+    let mut soft = SoftMotion::new(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
+    // Only the hull is made of the ratios, which take as much memory as the images.
+    soft.views.iter_mut().for_each(|view| view.ratios.clear());
     let targets = Targets::new(dataset, &soft, &config.gaussians)?;
     let form = targets.form(config.gaussians.form);
     notes.extend(between_phases(

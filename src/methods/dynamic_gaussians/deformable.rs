@@ -14,13 +14,18 @@ use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup, GaussianView};
+use crate::methods::dynamic_gaussians::catheter::Catheter;
 use crate::methods::dynamic_gaussians::per_phase::{MAX_PASSES, check_count, strong};
 use crate::methods::dynamic_gaussians::pruning::{Judge, short_components};
 use crate::methods::dynamic_gaussians::stages::{
     DeformableKernels, DeformablePass, GridBuffers, OwnMotion, OwnMotionBuffers, Track,
 };
-use crate::methods::dynamic_gaussians::stages::{record_guess, record_images, record_step, record_track};
-use crate::methods::dynamic_gaussians::target_buffers::{padded, renew_bounds, take_images, target_buffers};
+use crate::methods::dynamic_gaussians::stages::{
+    PhasePart, record_guess, record_images, record_step, record_step_in_parts, record_track,
+};
+use crate::methods::dynamic_gaussians::target_buffers::{
+    Renewal, TargetPart, divided_targets, n_loss_parts, padded, renew_bounds, take_images,
+};
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::methods::dynamic_gaussians::{seeds, setup};
 use crate::model::groups::vessels;
@@ -41,6 +46,8 @@ pub struct DeformableTrainer {
     step: u32,
     /// Whether short components that the images do not support are dropped at the end.
     prunes: bool,
+    /// Catheter that was found at the end.
+    catheter: Option<Catheter>,
 }
 
 /// Setup, schedule and buffers of iterations of one kind: the joint fit of everything, or the tracking of a phase.
@@ -48,6 +55,8 @@ pub(super) struct Fit {
     setup: GaussianSetup,
     deformable: DeformableSetup,
     targets: TargetBuffers,
+    /// Parts of the images; tracking, which works on a phase at a time, has a single one.
+    parts: Vec<TargetPart>,
     grid: GridBuffers,
 }
 
@@ -55,10 +64,11 @@ impl Fit {
     /// A fit of everything, with a grid at rest.
     fn joint(gpu: &Gpu, targets: &Targets, config: &Config) -> Result<Fit> {
         let settings = targets.lengths.gaussians(&config.gaussians);
-        let setup = setup::gaussian_setup(targets, &settings);
+        let mut setup = setup::gaussian_setup(targets, &settings);
         let deformable = setup::deformable_setup(targets, &targets.deformable(&config.deformable));
-        let buffers = target_buffers(gpu, targets, &setup, &setup::schedule(&settings))?;
-        Ok(Fit { setup, deformable, targets: buffers, grid: GridBuffers::new(gpu, &deformable, targets.n_phases)? })
+        let (buffers, parts) = divided_targets(gpu, targets, &mut setup, &setup::schedule(&settings))?;
+        let grid = GridBuffers::new(gpu, &deformable, targets.n_phases)?;
+        Ok(Fit { setup, deformable, targets: buffers, parts, grid })
     }
 
     /// A fit of the same grid to the same images, blurred, a phase at a time.
@@ -70,7 +80,7 @@ impl Fit {
                 let image = Image { width: targets.width, height: targets.height, values: image.to_vec() };
                 blur(&image, settings.track_blur as f32).values
             });
-            padded(&images.collect::<Vec<_>>(), targets, &setup)
+            padded(&images.collect::<Vec<_>>(), targets.n_pixels(), &setup).into_owned()
         };
         // One phase at a time: the motion beyond it is not known yet.
         let at_phase = |view: &SplatView| SplatView { after_phase: 0.0, ..view.clone() }.to_device();
@@ -85,7 +95,31 @@ impl Fit {
             gaussian_ring: ring(gpu, "gaussian_ring of tracking")?,
             ..self.targets.clone()
         };
-        Ok(Fit { setup, deformable, targets: buffers, grid: self.grid.under(gpu, &deformable)? })
+        let parts = vec![TargetPart::all(targets, buffers.clone())];
+        Ok(Fit { setup, deformable, targets: buffers, parts, grid: self.grid.under(gpu, &deformable)? })
+    }
+
+    /// Returns the buffers of the Gaussians with moments of the splats of a single part of the images, where there are several parts.
+    fn scratch(&self, gpu: &Gpu, (particles, _): Bound<'_>, n: u32) -> Result<ParticleBuffers> {
+        let splats = |part: &TargetPart| part.phases.len() as u64 * u64::from(self.setup.n_views * n);
+        if self.parts.len() == 1 {
+            return Ok(particles.clone());
+        }
+        particles.with_moments(gpu, self.parts.iter().map(splats).max().unwrap_or(0))
+    }
+
+    /// Records one iteration; `scratch` is that of [`Fit::scratch`].
+    fn record_step<'a>(&'a self, pass: &mut DeformablePass<'a>, scratch: &'a ParticleBuffers) -> Result<()> {
+        if self.parts.len() == 1 {
+            return record_step(pass);
+        }
+        let part = |part: &'a TargetPart| PhasePart {
+            phases: part.phases.clone(),
+            n_images: part.images.len() as u32,
+            n_loss_parts: n_loss_parts(&part.images, &self.setup),
+            targets: &part.buffers,
+        };
+        record_step_in_parts(pass, &self.parts.iter().map(part).collect::<Vec<_>>(), scratch)
     }
 }
 
@@ -115,6 +149,7 @@ impl DeformableTrainer {
             iterations,
             step: 0,
             prunes: true,
+            catheter: None,
         })
     }
 
@@ -213,6 +248,15 @@ impl DeformableTrainer {
         &self.own
     }
 
+    /// Returns the use of the bounds that are renewed now: the host keeps no bounds of large images that it does not need.
+    fn renewal(&self) -> Renewal {
+        let settings = &self.config.gaussians;
+        let renews_again = |step: u32| step > self.step && setup::renews_background(settings, step);
+        let needed = |step: u32| renews_again(step) || setup::grows(settings, step);
+        let is_large = self.targets.coarse_factor() > 1;
+        if is_large && !(self.step..settings.iterations).any(needed) { Renewal::Last } else { Renewal::OneOfSeveral }
+    }
+
     /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; returns the
     /// losses of the iterations done, penalties not included. An empty list means the target was reached before.
     ///
@@ -229,7 +273,8 @@ impl DeformableTrainer {
         let stop = setup::next_stop(settings, self.step, until);
         if renew {
             let images = self.images()?;
-            renew_bounds(&self.gpu, &mut self.targets, &self.joint.targets, &self.joint.setup, &images)?;
+            let renewal = self.renewal();
+            renew_bounds(&self.gpu, &mut self.targets, &self.joint.parts, &self.joint.setup, &images, renewal)?;
         }
         if grow {
             self.grow()?;
@@ -243,6 +288,7 @@ impl DeformableTrainer {
             self.drop_strays()?;
             if self.prunes {
                 self.drop_unsupported()?;
+                self.find_catheter()?;
             }
         }
         losses(&self.gpu, &self.joint.targets.gaussian_ring, first..self.step, SMALLER_STEPS)
@@ -277,6 +323,29 @@ impl DeformableTrainer {
     fn drop_strays(&mut self) -> Result<()> {
         let (link, setup) = (self.targets.lengths.gaussians(&self.config.gaussians).link, self.joint.setup);
         self.retain(|rows| vessels(rows, &setup, link)).map(|_| ())
+    }
+
+    /// Looks for a catheter, and drops it where the settings say so.
+    fn find_catheter(&mut self) -> Result<()> {
+        self.catheter = Catheter::find(&self.deformable()?, self.targets.lengths.factor);
+        let dropped = self.catheter.as_ref().filter(|_| self.config.gaussians.without_catheter);
+        if let Some(keep) = dropped.map(|catheter| catheter.members.iter().map(|member| !member).collect()) {
+            self.retain(|_| keep)?;
+        }
+        Ok(())
+    }
+
+    /// Returns a sentence on the catheter that was found, once.
+    pub(super) fn take_catheter(&mut self) -> Option<String> {
+        let Catheter { extent_mm, slowest, .. } = self.catheter.take()?;
+        let found = format!(
+            "a catheter seems to be in the dynamic field: {extent_mm:.0} mm whose motion falls to {:.0} % of that of the vessels",
+            100.0 * slowest
+        );
+        Some(match self.config.gaussians.without_catheter {
+            true => format!("{found}; it is left out (gaussians.without_catheter)"),
+            false => format!("{found}; --set gaussians.without_catheter=true leaves it out of field, tree and scores"),
+        })
     }
 
     /// Drops short components that the images do not support.
@@ -341,9 +410,12 @@ impl DeformableTrainer {
     /// # Errors
     /// Device errors.
     pub(super) fn images_through(&self, views: &[SplatView]) -> Result<Vec<f32>> {
-        let upload = |views: &[SplatView]| {
+        let upload = |views: &[SplatView]| -> Result<()> {
             let views: Vec<GaussianView> = views.iter().map(SplatView::to_device).collect();
-            self.gpu.upload(&self.joint.targets.gaussian_views, 0, &views)
+            for part in &self.joint.parts {
+                self.gpu.upload(&part.buffers.gaussian_views, 0, &views[part.images.clone()])?;
+            }
+            Ok(())
         };
         upload(views)?;
         let images = self.images();
@@ -353,11 +425,16 @@ impl DeformableTrainer {
 
     /// Images of `n` Gaussians that move on the present grid.
     fn images_of(&self, bound: Bound<'_>, n: u32) -> Result<Vec<f32>> {
-        let mut recording = Recording::new(&self.gpu, "images of a deformable")?;
-        let mut pass = pass(&mut recording, &self.kernels, &self.joint, bound, n);
-        record_images(&mut pass, 0..self.joint.setup.n_phases)?;
-        self.gpu.wait(recording.finish()?.submit()?)?;
-        take_images(&self.gpu, &self.joint.targets, &self.targets, &self.joint.setup)
+        let mut images = Vec::with_capacity(self.targets.n_images * self.targets.n_pixels());
+        for part in &self.joint.parts {
+            let mut recording = Recording::new(&self.gpu, "images of a deformable")?;
+            let mut pass = pass(&mut recording, &self.kernels, &self.joint, bound, n);
+            pass.gaussians.targets = &part.buffers;
+            record_images(&mut pass, part.phases.clone())?;
+            self.gpu.wait(recording.finish()?.submit()?)?;
+            take_images(&self.gpu, part, &self.targets, &self.joint.setup, &mut images)?;
+        }
+        Ok(images)
     }
 
     /// The deformable set after the iterations done.
@@ -400,7 +477,8 @@ impl DeformableTrainer {
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         let mut recording = Recording::timed(&self.gpu, "profiled iteration of a deformable", MAX_PASSES)?;
         let bound = (&self.particles, &self.own);
-        record_step(&mut pass(&mut recording, &self.kernels, &self.joint, bound, self.n))?;
+        let scratch = self.joint.scratch(&self.gpu, bound, self.n)?;
+        self.joint.record_step(&mut pass(&mut recording, &self.kernels, &self.joint, bound, self.n), &scratch)?;
         self.step += 1;
         pass_times(&self.gpu, recording)
     }
@@ -454,11 +532,12 @@ fn record(
     n: u32,
     per_submit: u32,
 ) -> Result<Iterations> {
+    let scratch = fit.scratch(gpu, bound, n)?;
     Iterations::record(gpu, per_submit, |iterations| {
         let mut recording = Recording::new(gpu, &format!("{iterations} iterations of a deformable"))?;
         let mut pass = pass(&mut recording, kernels, fit, bound, n);
         for _ in 0..iterations {
-            record_step(&mut pass)?;
+            fit.record_step(&mut pass, &scratch)?;
         }
         Ok(recording.finish()?)
     })

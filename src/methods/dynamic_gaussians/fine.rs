@@ -5,6 +5,7 @@ use crate::error::Result;
 use crate::gaussians::particles::Particles;
 use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::remainder::MIN_PHASES;
 use crate::methods::dynamic_gaussians::setup;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
@@ -24,6 +25,11 @@ impl Fine {
         match setup::fine_step(&config.gaussians).filter(|_| factor > 1) {
             Some(from) => {
                 let coarse = targets.coarser(factor, config.gaussians.noise_scale);
+                let mut targets = targets;
+                // All pixels are used from a renewal of the bounds on, which needs upper bounds alone.
+                if targets.fewest_phases() >= MIN_PHASES {
+                    targets.low = Vec::new();
+                }
                 (coarse, Some(Box::new(Fine { gpu: gpu.clone(), targets, config: config.clone(), from })))
             }
             None => (targets, None),

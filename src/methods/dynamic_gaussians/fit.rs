@@ -140,6 +140,15 @@ impl GaussianFit {
         })
     }
 
+    /// Returns findings about the data since the last call, for the user.
+    pub(crate) fn take_findings(&mut self) -> Vec<String> {
+        match self {
+            GaussianFit::Deformable(fit, _) => fit.take_catheter().into_iter().collect(),
+            GaussianFit::Made(fit) => fit.take_findings(),
+            GaussianFit::PerPhase(_) | GaussianFit::Start(..) => Vec::new(),
+        }
+    }
+
     /// Number of Gaussians.
     pub(crate) fn count(&self) -> u32 {
         match self {

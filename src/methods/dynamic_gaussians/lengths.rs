@@ -3,7 +3,8 @@
 
 use crate::config::sections::{Deformable, Gaussians};
 use crate::evidence::series::blur;
-use crate::raster::{Image, percentile};
+use crate::raster::Image;
+use std::borrow::Borrow;
 
 /// Smaller side, pixels, of the images to which the settings' lengths refer.
 const SIDE: f64 = 100.0;
@@ -28,11 +29,11 @@ pub struct Lengths {
 }
 
 impl Lengths {
-    /// Lengths for images whose smaller side has `side` pixels, with vessels of `width` pixels ([`vessel_width`]) and noise per
-    /// pixel, as a share of the strongest change; `min_scale` is the setting.
-    pub fn new(side: usize, width: f64, noise: &[f32], min_scale: f64) -> Lengths {
+    /// Lengths for images whose smaller side has `side` pixels, with vessels of `width` pixels ([`vessel_width`]) and the median
+    /// `noise` of their pixels, as a share of the strongest change; `min_scale` is the setting.
+    pub fn new(side: usize, width: f64, noise: f32, min_scale: f64) -> Lengths {
         let factor = side as f64 / SIDE;
-        let share = f64::from(percentile(noise, 0.5)) / NOISY;
+        let share = f64::from(noise) / NOISY;
         let wanted = 1.0 + (SMOOTHEST - 1.0) * share.clamp(0.0, 1.0);
         let possible = SHARE_OF_WIDTH * width / (factor * min_scale);
         Lengths { factor, smoothing: wanted.min(possible).max(1.0) }
@@ -66,11 +67,12 @@ impl Lengths {
 
 /// Mean width, pixels, of vessels whose change of the `images` is a large share of the `strongest` change: twice their area
 /// over the length of their outline; 0 without any.
-pub fn vessel_width<'a>(images: impl Iterator<Item = &'a Image>, strongest: f32) -> f64 {
+pub fn vessel_width(images: impl Iterator<Item = impl Borrow<Image>>, strongest: f32) -> f64 {
     // A line of any direction crosses on average 4 / pi as many edges of pixels as it is long.
     const EDGES_PER_LENGTH: f64 = 4.0 / std::f64::consts::PI;
     let (mut area, mut edges) = (0usize, 0usize);
     for image in images {
+        let image = image.borrow();
         let (w, h) = (image.width, image.height);
         let blurred = blur(image, WIDE_BLUR);
         let wide = |x: usize, y: usize| x < w && y < h && blurred.values[y * w + x] > WIDE_CHANGE * strongest;
@@ -110,7 +112,7 @@ mod tests {
     fn lengths_follow_the_images_and_noise_the_vessels_width() {
         let settings = Config::preset(Preset::Fast).gaussians;
         let min = |size: usize, width: f64, noise: f32| {
-            Lengths::new(size, width, &[noise; 9], settings.min_scale).gaussians(&settings).min_scale
+            Lengths::new(size, width, noise, settings.min_scale).gaussians(&settings).min_scale
         };
         assert!((min(100, 5.0, 0.0) - 0.4).abs() < 1e-9 && (min(200, 10.0, 0.0) - 0.8).abs() < 1e-9);
         assert!((min(100, 5.0, 0.2) - 0.6).abs() < 1e-9 && (min(200, 10.0, 0.2) - 1.2).abs() < 1e-9);

@@ -36,6 +36,11 @@ impl Made {
         self.fit.losses[first..end].to_vec()
     }
 
+    /// Returns findings about the data since the last call, for the user.
+    pub(crate) fn take_findings(&mut self) -> Vec<String> {
+        std::mem::take(&mut self.fit.findings)
+    }
+
     /// Returns the field after all iterations.
     pub(crate) fn field(&self) -> &DynamicGaussians {
         &self.fit.gaussians
@@ -45,8 +50,11 @@ impl Made {
 /// Returns the fingerprint of all that decides a fit that has not begun.
 pub(crate) fn fingerprint(targets: &Targets, config: &Config) -> String {
     let mut fingerprint = Fingerprint::default();
-    let images = [&targets.images, &targets.low, &targets.high, &targets.weight, &targets.noise, &targets.contrast];
+    let images = [&targets.images, &targets.low, &targets.high, &targets.contrast];
     images.into_iter().flatten().for_each(|v| fingerprint.word(v.to_bits()));
+    for image in (0..targets.n_images).flat_map(|image| [targets.weight.image(image), targets.noise.image(image)]) {
+        image.iter().for_each(|v| fingerprint.word(v.to_bits()));
+    }
     for view in &targets.views {
         fingerprint.bytes(format!("{view:?}").as_bytes());
     }

@@ -11,7 +11,9 @@ use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup};
-use crate::methods::dynamic_gaussians::target_buffers::{renew_bounds, take_images, target_buffers};
+use crate::methods::dynamic_gaussians::target_buffers::{
+    Renewal, TargetPart, renew_bounds, take_images, undivided_targets,
+};
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::methods::dynamic_gaussians::{seeds, setup};
 use crate::model::groups::vessels;
@@ -25,7 +27,7 @@ pub struct GaussianTrainer {
     setup: GaussianSetup,
     per_submit: u32,
     kernels: GaussianKernels,
-    buffers: TargetBuffers,
+    part: TargetPart,
     particles: ParticleBuffers,
     n: u32,
     iterations: Iterations,
@@ -56,10 +58,10 @@ impl GaussianTrainer {
         let settings = targets.lengths.gaussians(&config.gaussians);
         let setup = setup::gaussian_setup(&targets, &settings);
         let kernels = GaussianKernels::new(gpu)?;
-        let buffers = target_buffers(gpu, &targets, &setup, &setup::schedule(&settings))?;
+        let part = undivided_targets(gpu, &targets, &setup, &setup::schedule(&settings))?;
         let particles = particles.upload(gpu, setup.n_views)?;
         let per_submit = config.train.iterations_per_submit;
-        let iterations = record(gpu, &kernels, &buffers, &particles, &setup, n, per_submit)?;
+        let iterations = record(gpu, &kernels, &part.buffers, &particles, &setup, n, per_submit)?;
         Ok(GaussianTrainer {
             gpu: gpu.clone(),
             targets,
@@ -68,7 +70,7 @@ impl GaussianTrainer {
             setup,
             per_submit,
             kernels,
-            buffers,
+            part,
             particles,
             n,
             iterations,
@@ -108,7 +110,7 @@ impl GaussianTrainer {
 
     /// Target buffers on the device, for tests.
     pub fn target_buffers(&self) -> &TargetBuffers {
-        &self.buffers
+        &self.part.buffers
     }
 
     /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; returns the
@@ -139,14 +141,15 @@ impl GaussianTrainer {
         if setup::parts_from_strays(&self.settings, self.step) {
             self.drop_strays()?;
         }
-        losses(&self.gpu, &self.buffers.gaussian_ring, first..self.step, SMALLER_STEPS)
+        losses(&self.gpu, &self.part.buffers.gaussian_ring, first..self.step, SMALLER_STEPS)
     }
 
     /// Estimates the static background anew from what the Gaussians leave of the images, and with it the bounds of the
     /// fit's targets.
     pub(super) fn renew_background(&mut self) -> Result<()> {
         let images = self.images()?;
-        renew_bounds(&self.gpu, &mut self.targets, &self.buffers, &self.setup, &images)
+        let parts = std::slice::from_ref(&self.part);
+        renew_bounds(&self.gpu, &mut self.targets, parts, &self.setup, &images, Renewal::OneOfSeveral)
     }
 
     /// Drops weak Gaussians and places new ones where data are missing. This happens once in a run, so the host does it: it
@@ -178,12 +181,13 @@ impl GaussianTrainer {
         self.n = check_count(particles)?;
         self.particles = particles.upload(&self.gpu, self.setup.n_views)?;
         let (setup, n) = (&self.setup, self.n);
-        self.iterations = record(&self.gpu, &self.kernels, &self.buffers, &self.particles, setup, n, self.per_submit)?;
+        self.iterations =
+            record(&self.gpu, &self.kernels, &self.part.buffers, &self.particles, setup, n, self.per_submit)?;
         Ok(())
     }
 
     fn pass<'a>(&'a self, recording: &'a mut Recording) -> GaussianPass<'a> {
-        let (kernels, targets, particles) = (&self.kernels, &self.buffers, &self.particles);
+        let (kernels, targets, particles) = (&self.kernels, &self.part.buffers, &self.particles);
         GaussianPass { recording, kernels, targets, particles, setup: &self.setup, n: self.n }
     }
 
@@ -195,7 +199,9 @@ impl GaussianTrainer {
         let mut recording = Recording::new(&self.gpu, "images of Gaussians")?;
         record_images(&mut self.pass(&mut recording))?;
         self.gpu.wait(recording.finish()?.submit()?)?;
-        take_images(&self.gpu, &self.buffers, &self.targets, &self.setup)
+        let mut images = Vec::with_capacity(self.targets.n_images * self.targets.n_pixels());
+        take_images(&self.gpu, &self.part, &self.targets, &self.setup, &mut images)?;
+        Ok(images)
     }
 
     /// The field after the iterations done.

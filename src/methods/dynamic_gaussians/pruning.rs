@@ -141,7 +141,7 @@ mod tests {
         assert!(!supported(&seen([0.0; VIEWS])), "noise");
         let mut covered = seen([1.0, 1.0, 0.0]);
         let of_third = |i: usize| i / PIXELS % VIEWS == 2;
-        (0..covered.weight.len()).filter(|i| of_third(*i)).for_each(|i| covered.weight[i] = 0.0);
+        (0..field.len()).filter(|i| of_third(*i)).for_each(|i| covered.weight[i] = 0.0);
         assert!(supported(&covered), "a blade covers it in the third view");
     }
 

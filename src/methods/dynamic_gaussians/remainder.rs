@@ -14,9 +14,11 @@ const SLOW_BLUR_SHARE: f64 = 0.02;
 /// Line integral above the estimate that costs nothing, in standard deviations of the noise.
 const FREE_NOISE: f32 = 2.0;
 
-/// Bounds of the dynamic field's images, `[image][pixel]`, shares of the strongest change.
+/// Bounds of the dynamic field's image, `[pixel]`, shares of the strongest change.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bounds {
+    /// Index of the image.
+    pub image: usize,
     /// Minimum line integral that explains the pixel.
     pub low: Vec<f32>,
     /// Maximum line integral that explains the pixel.
@@ -24,7 +26,7 @@ pub struct Bounds {
 }
 
 /// Fewest phases of a view from which its background is estimated.
-const MIN_PHASES: usize = 3;
+pub(super) const MIN_PHASES: usize = 3;
 
 /// Background of an image that a field leaves.
 struct Background {
@@ -33,10 +35,10 @@ struct Background {
     values: Vec<f32>,
 }
 
-/// Computes the background of each image that the field's `images` (`[image][pixel]`, shares of the strongest change) leave. Views
-/// of fewer than three phases are left out.
-fn backgrounds(targets: &Targets, images: &[f32]) -> Vec<Background> {
-    let of_view = |view: usize| {
+/// Computes the background of each image that the field's `images` (`[image][pixel]`, shares of the strongest change) leave, one view
+/// after the other, because backgrounds of large images take much memory. Views of fewer than three phases are left out.
+fn backgrounds(targets: &Targets, images: &[f32]) -> impl Iterator<Item = Background> {
+    let of_view = move |view: usize| -> Vec<Background> {
         let of_view: Vec<usize> =
             targets.image_of.iter().skip(view).step_by(targets.n_views).flatten().copied().collect();
         if of_view.len() < MIN_PHASES {
@@ -45,7 +47,7 @@ fn backgrounds(targets: &Targets, images: &[f32]) -> Vec<Background> {
         let left: Vec<Image> = of_view.iter().map(|image| left(targets, images, *image)).collect();
         let level = level(&left);
         let background = |(image, left): (&usize, &Image)| {
-            let slow = slow(left, &level, &targets.weight[image * targets.n_pixels()..]);
+            let slow = slow(left, &level, targets.weight.image(*image));
             Background {
                 image: *image,
                 values: level.iter().zip(&slow.values).map(|(level, slow)| level + slow).collect(),
@@ -53,23 +55,23 @@ fn backgrounds(targets: &Targets, images: &[f32]) -> Vec<Background> {
         };
         of_view.par_iter().zip(&left).map(background).collect()
     };
-    (0..targets.n_views).flat_map(of_view).collect()
+    (0..targets.n_views).flat_map(of_view)
 }
 
-/// Computes bounds from the background that the field's `images` (`[image][pixel]`, shares of the strongest change) leave. Views of
-/// fewer than three phases keep their `bounds`.
-pub fn bounds(targets: &Targets, images: &[f32], mut bounds: Bounds) -> Bounds {
-    let n = targets.n_pixels();
-    for Background { image, values } in backgrounds(targets, images) {
-        for (p, background) in values.iter().enumerate() {
-            let at = image * n + p;
-            let contrast = targets.contrast[image];
-            let low = (targets.images[at] - background) / contrast;
-            bounds.low[at] = low;
-            bounds.high[at] = targets.max[at].min(low + FREE_NOISE * targets.noise[at] / contrast).max(low);
-        }
-    }
-    bounds
+/// Computes bounds from the background that the field's `images` (`[image][pixel]`, shares of the strongest change) leave, image by image
+/// and one view after the other. Views of fewer than three phases are left out: they keep their bounds.
+pub fn bounds(targets: &Targets, images: &[f32]) -> impl Iterator<Item = Bounds> {
+    let max = targets.max.as_ref().unwrap_or(&targets.high);
+    let of_image = move |Background { image, values }: Background| {
+        let (contrast, noise) = (targets.contrast[image], targets.noise.image(image));
+        let begin = image * targets.n_pixels();
+        let low: Vec<f32> =
+            values.iter().enumerate().map(|(p, b)| (targets.images[begin + p] - b) / contrast).collect();
+        let high = |(p, low): (usize, &f32)| max[begin + p].min(low + FREE_NOISE * noise[p] / contrast).max(*low);
+        let high = low.iter().enumerate().map(high).collect();
+        Bounds { image, low, high }
+    };
+    backgrounds(targets, images).map(of_image)
 }
 
 /// Returns, for each image, what the field's `images` and the background leave of it, shares of the strongest change, and 0 in hidden
@@ -78,8 +80,9 @@ pub(super) fn remainders(targets: &Targets, images: &[f32]) -> Vec<Option<Vec<f3
     let mut remainders = vec![None; targets.n_images];
     let n = targets.n_pixels();
     for Background { image, values } in backgrounds(targets, images) {
+        let weight = targets.weight.image(image);
         let of_pixel = |(p, background): (usize, &f32)| match image * n + p {
-            at if targets.weight[at] == 0.0 => 0.0,
+            _ if weight[p] == 0.0 => 0.0,
             at => targets.images[at] - targets.contrast[image] * images[at] - background,
         };
         remainders[image] = Some(values.iter().enumerate().map(of_pixel).collect());
@@ -137,10 +140,6 @@ mod tests {
         (vessel, background)
     }
 
-    fn before_it(targets: &Targets) -> Bounds {
-        Bounds { low: targets.low.clone(), high: targets.high.clone() }
-    }
-
     fn error(bound: &[f32], vessel: &[f32]) -> f32 {
         bound.iter().zip(vessel).map(|(b, v)| (b - v).abs()).sum::<f32>() / vessel.len() as f32
     }
@@ -152,12 +151,14 @@ mod tests {
         let targets = targets(&images, 1);
         // A field that has found most of the vessel.
         let found: Vec<f32> = vessel.iter().map(|v| 0.8 * v).collect();
-        let bounds = bounds(&targets, &found, before_it(&targets));
-        let (before, low, high) =
-            (error(&targets.low, &vessel), error(&bounds.low, &vessel), error(&bounds.high, &vessel));
+        let all: Vec<Bounds> = bounds(&targets, &found).collect();
+        assert!(all.iter().map(|bounds| bounds.image).eq(0..PHASES), "one view, a phase after the other");
+        let concat = |of: fn(&Bounds) -> &Vec<f32>| all.iter().flat_map(of).copied().collect::<Vec<f32>>();
+        let (lows, highs) = (concat(|b| &b.low), concat(|b| &b.high));
+        let (before, low, high) = (error(&targets.low, &vessel), error(&lows, &vessel), error(&highs, &vessel));
         println!("{before:.4} to {low:.4}, {high:.4}");
         assert!(low < 0.5 * before && high < 0.5 * before, "{before} to {low}, {high}");
-        assert!(bounds.low.iter().zip(&bounds.high).all(|(low, high)| low <= high && high.is_finite()));
+        assert!(lows.iter().zip(&highs).all(|(low, high)| low <= high && high.is_finite()));
     }
 
     #[test]
@@ -165,8 +166,7 @@ mod tests {
         let (vessel, _) = scene();
         let mut targets = targets(&vessel, 1);
         targets.image_of.iter_mut().skip(2).for_each(|image| *image = None);
-        let bounds = bounds(&targets, &vec![0.3; vessel.len()], before_it(&targets));
-        assert_eq!((bounds.low, bounds.high), (targets.low, targets.high));
+        assert_eq!(bounds(&targets, &vec![0.3; vessel.len()]).count(), 0);
     }
 
     #[test]
@@ -196,11 +196,7 @@ mod tests {
     fn hidden_pixels_leave_nothing() {
         let (vessel, _) = scene();
         let mut targets = targets(&vec![1.0; vessel.len()], 1);
-        targets
-            .weight
-            .iter_mut()
-            .enumerate()
-            .for_each(|(p, weight)| *weight = f32::from(u8::from(p % SIDE >= SIDE / 2)));
+        (0..vessel.len()).for_each(|p| targets.weight[p] = f32::from(u8::from(p % SIDE >= SIDE / 2)));
         let left = remainders(&targets, &vessel);
         let hidden = |p: usize| p % SIDE < SIDE / 2;
         let of = |image: &[f32]| (0..image.len()).filter(|p| hidden(*p)).all(|p| image[p] == 0.0);

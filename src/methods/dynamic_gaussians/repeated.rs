@@ -134,6 +134,11 @@ impl Repeated {
         Ok(Vec::new())
     }
 
+    /// Returns findings of the last fit about the data since the last call, for the user.
+    pub(crate) fn take_findings(&mut self) -> Vec<String> {
+        if self.is_last() { self.fit.take_findings() } else { Vec::new() }
+    }
+
     /// Returns the images of a fit that is followed by so many others. The last fit takes them over.
     fn images(&mut self, left: u32) -> Result<Targets> {
         let images = if left == 0 { self.targets.take() } else { self.targets.clone() };

@@ -2,8 +2,8 @@
 
 use crate::error::Result;
 use crate::gaussians::field::basis;
-use crate::gaussians::particles::retain_marked;
-use crate::gaussians::stages::GaussianPass;
+use crate::gaussians::particles::{MOMENTS_BYTES, ParticleBuffers, retain_marked};
+use crate::gaussians::stages::{GaussianPass, TargetBuffers};
 use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Groups;
@@ -203,10 +203,15 @@ impl DeformablePass<'_> {
 
     /// Records the gradient at some phases, whose images are `images`.
     fn gradient(&mut self, phases: Range<u32>, images: Range<u32>) -> Result<()> {
-        let n_gaussians = self.gaussians.n;
         record_images(self, phases.clone())?;
         let n_splats = self.n_splats(&phases);
         self.gaussians.residual(images, n_splats)?;
+        self.gradient_of_moments(phases)
+    }
+
+    /// Records the gradient at some phases from the moments of their splats.
+    fn gradient_of_moments(&mut self, phases: Range<u32>) -> Result<()> {
+        let n_gaussians = self.gaussians.n;
         let DeformableKernels { gradient, grid_gradient, .. } = self.kernels;
         let (first_phase, n_phases) = (phases.start, phases.len() as u32);
         let push = push::DeformableGradient { n_gaussians, first_phase, n_phases };
@@ -214,6 +219,22 @@ impl DeformablePass<'_> {
         let push = push::DeformableGridGradient { n_gaussians, first_phase, n_phases };
         let groups = phases.len().div_ceil(constants::deformable_grid_gradient::PHASES as usize);
         self.run(grid_gradient, self.nodes(grid_gradient, groups), push)
+    }
+
+    /// Records the projection of all Gaussians into every view at some phases.
+    fn project(&mut self, phases: &Range<u32>) -> Result<()> {
+        let (project, n_gaussians) = (&self.kernels.project, self.gaussians.n);
+        let n_seen = phases.len() as u32 * self.gaussians.setup.n_views;
+        let groups = Groups::Direct([n_gaussians.div_ceil(project.local_size()), n_seen, 1]);
+        self.run(project, groups, push::DeformableProject { n_gaussians, first_phase: phases.start })
+    }
+
+    /// Records the optimiser and the end of an iteration over all phases.
+    fn update(&mut self) -> Result<()> {
+        let (update, n_gaussians) = (&self.kernels.update, self.gaussians.n);
+        self.run(update, update.groups_for(n_gaussians), push::DeformableUpdate { n_gaussians })?;
+        self.grid_update(0..self.gaussians.setup.n_phases)?;
+        self.gaussians.report()
     }
 
     fn grid_update(&mut self, phases: Range<u32>) -> Result<()> {
@@ -228,10 +249,7 @@ impl DeformablePass<'_> {
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
 pub fn record_images(pass: &mut DeformablePass<'_>, phases: Range<u32>) -> Result<()> {
-    let (project, n_gaussians) = (&pass.kernels.project, pass.gaussians.n);
-    let n_seen = phases.len() as u32 * pass.gaussians.setup.n_views;
-    let groups = Groups::Direct([n_gaussians.div_ceil(project.local_size()), n_seen, 1]);
-    pass.run(project, groups, push::DeformableProject { n_gaussians, first_phase: phases.start })?;
+    pass.project(&phases)?;
     pass.gaussians.splats(pass.n_splats(&phases))
 }
 
@@ -240,11 +258,53 @@ pub fn record_images(pass: &mut DeformablePass<'_>, phases: Range<u32>) -> Resul
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
 pub fn record_step(pass: &mut DeformablePass<'_>) -> Result<()> {
-    let (update, setup, n_gaussians) = (&pass.kernels.update, pass.gaussians.setup, pass.gaussians.n);
+    let setup = pass.gaussians.setup;
     pass.gradient(0..setup.n_phases, 0..setup.n_images)?;
-    pass.run(update, update.groups_for(n_gaussians), push::DeformableUpdate { n_gaussians })?;
-    pass.grid_update(0..setup.n_phases)?;
-    pass.gaussians.report()
+    pass.update()
+}
+
+/// Images of some phases, where those of all phases are more than one buffer holds.
+pub struct PhasePart<'a> {
+    /// The phases.
+    pub phases: Range<u32>,
+    /// Number of their images.
+    pub n_images: u32,
+    /// Number of partial sums of their loss.
+    pub n_loss_parts: u32,
+    /// Their buffers, in which images are counted from the first one of the part on.
+    pub targets: &'a TargetBuffers,
+}
+
+/// Records one iteration over all phases, whose images are divided into `parts`: the moments of all splats are collected part by part. The
+/// moments in `scratch` hold those of one part. The result is that of [`record_step`], but for the order of the sum of the loss.
+///
+/// # Errors
+/// Errors of [`record_step`].
+pub fn record_step_in_parts<'a>(
+    pass: &mut DeformablePass<'a>,
+    parts: &[PhasePart<'a>],
+    scratch: &'a ParticleBuffers,
+) -> Result<()> {
+    let (whole, particles) = (pass.gaussians.targets, pass.gaussians.particles);
+    let (mut moments_done, mut losses_done) = (0, 0);
+    for part in parts.iter().filter(|part| part.n_images > 0) {
+        let n_splats = pass.n_splats(&part.phases);
+        (pass.gaussians.targets, pass.gaussians.particles) = (part.targets, scratch);
+        record_images(pass, part.phases.clone())?;
+        pass.gaussians.residual(0..part.n_images, n_splats)?;
+        let recording = &mut pass.gaussians.recording;
+        let moments = MOMENTS_BYTES * u64::from(n_splats);
+        recording.copy(&scratch.splat_moments, 0, &particles.splat_moments, moments_done, moments)?;
+        let losses = size_of::<f32>() as u64 * u64::from(part.n_loss_parts);
+        recording.copy(&part.targets.gaussian_loss_parts, 0, &whole.gaussian_loss_parts, losses_done, losses)?;
+        (moments_done, losses_done) = (moments_done + moments, losses_done + losses);
+    }
+    (pass.gaussians.targets, pass.gaussians.particles) = (whole, particles);
+    let all = 0..pass.gaussians.setup.n_phases;
+    // Splats are those of the last part now.
+    pass.project(&all)?;
+    pass.gradient_of_moments(all)?;
+    pass.update()
 }
 
 /// A phase to be tracked, and the two preceding phases, from which its grid is extrapolated.

@@ -2,7 +2,6 @@
 
 use crate::config::sections::Deformable;
 use crate::methods::dynamic_gaussians::targets::Targets;
-use crate::raster::percentile;
 
 /// Number of views up to which the motion is stiff in noise: with few views, free motion explains noise.
 const FEW_VIEWS: usize = 3;
@@ -15,7 +14,7 @@ const STIFF_SMOOTHNESS: f64 = 0.02;
 impl Targets {
     /// Tells whether noise is so strong that a fit explains much of it.
     pub fn is_noisy(&self) -> bool {
-        percentile(&self.noise, 0.5) >= NOISY
+        self.noise.median() >= NOISY
     }
 
     /// Tells whether the motion of a deformable set is limited to that of a smooth grid.

@@ -7,6 +7,7 @@ use crate::evidence::series::Series;
 use crate::gaussians::field::Units;
 use crate::gaussians::view::SplatView;
 use crate::methods::dynamic_gaussians::lengths::{Lengths, vessel_width};
+use crate::methods::dynamic_gaussians::shared_images::SharedImages;
 use crate::methods::dynamic_gaussians::soft_hull::carve::{HullCell, SoftMotion};
 use crate::raster::Image;
 use crate::scan::dataset::Dataset;
@@ -51,16 +52,17 @@ pub struct Targets {
     pub n_images: usize,
     /// `[image][pixel]`: line integrals of the images, shares of the strongest change.
     pub images: Vec<f32>,
-    /// `[image][pixel]`: maximum line integral of the dynamic field that is known before the fit.
-    pub max: Vec<f32>,
+    /// `[image][pixel]`: maximum line integral of the dynamic field that is known before the fit, where [`Targets::high`] has been
+    /// replaced by lower ones; none where it is equal to [`Targets::high`].
+    pub max: Option<Vec<f32>>,
     /// `[image][pixel]`: minimum line integral of the dynamic field that explains the pixel.
     pub low: Vec<f32>,
     /// `[image][pixel]`: maximum line integral of the dynamic field that explains the pixel.
     pub high: Vec<f32>,
-    /// `[image][pixel]`: factor on the residual, from the pixel's noise.
-    pub weight: Vec<f32>,
-    /// `[image][pixel]`: standard deviation of the noise, share of the strongest change.
-    pub noise: Vec<f32>,
+    /// `[image][pixel]`: factor on the residual, from the pixel's noise; equal for all images of a view.
+    pub weight: SharedImages,
+    /// `[image][pixel]`: standard deviation of the noise, share of the strongest change; equal for all images of a view.
+    pub noise: SharedImages,
     /// `[image]`: contrast of the vessels, by which the field's line integrals are multiplied where it is compared with the image.
     pub contrast: Vec<f32>,
     /// Lengths of the settings on these images.
@@ -114,7 +116,7 @@ impl Targets {
                            ray";
             return Err(Error::unmet("dataset", dataset.path.display(), problem));
         }
-        Series::of(dataset).iter().try_for_each(|s| check_finite(dataset, s))?;
+        Series::each(dataset).try_for_each(|s| check_finite(dataset, &s))?;
         let strongest = median(motion.views.iter().map(|v| f64::from(v.background.strongest)).collect());
         if strongest.is_nan() || strongest <= 0.0 || motion.hull.share() == 0.0 {
             return Err(Error::unmet("dataset", dataset.path.display(), no_common_motion(motion)));
@@ -135,19 +137,24 @@ impl Targets {
             image_of: vec![None; n_phases * motion.views.len()],
             n_images: 0,
             images: Vec::new(),
-            max: Vec::new(),
+            max: None,
             low: Vec::new(),
             high: Vec::new(),
-            weight: Vec::new(),
-            noise: Vec::new(),
+            weight: SharedImages::of_each(Vec::new(), dataset.n_pixels()),
+            noise: SharedImages::of_each(Vec::new(), dataset.n_pixels()),
             contrast: Vec::new(),
             lengths: Lengths { factor: 1.0, smoothing: 1.0 },
             rest_phase: 0,
             places: Vec::new(),
             cell: motion.hull.cell / units.pixel,
         };
-        let weights: Vec<Vec<f32>> =
-            motion.views.iter().map(|v| weights(dataset, v, strongest, settings.noise_scale)).collect();
+        let share = |change: f32| (f64::from(change) / strongest) as f32;
+        let n_images: usize = motion.views.iter().map(|v| v.background.changes.iter().flatten().count()).sum();
+        // Vectors that grow would take up to three times the room.
+        for values in [&mut targets.images, &mut targets.low, &mut targets.high] {
+            values.reserve_exact(n_images * dataset.n_pixels());
+        }
+        let mut slots = Vec::new();
         // Images of a phase follow each other.
         for phase in 0..n_phases {
             for (slot, view) in motion.views.iter().enumerate() {
@@ -157,7 +164,6 @@ impl Targets {
                 };
                 let above = image.values.iter().zip(&view.background.low.values).map(|(y, b)| y - b);
                 let contrast = dataset.contrast_at(view.view, phase as u32);
-                let share = |change: f32| (f64::from(change) / strongest) as f32;
                 let of_field = |change: f32| (f64::from(change) / (contrast * strongest)) as f32;
                 targets.contrast.push(contrast as f32);
                 targets.image_of[phase * motion.views.len() + slot] = Some(targets.n_images);
@@ -168,24 +174,24 @@ impl Targets {
                 targets.images.extend(image.values.iter().map(|y| share(*y)));
                 targets.low.extend(change.values.iter().map(|d| of_field(*d)));
                 targets.high.extend(above.map(of_field));
-                targets.weight.extend(&weights[slot]);
-                targets.noise.extend(view.background.noise.values.iter().map(|s| share(*s)));
+                slots.push(slot);
             }
         }
+        let weights = motion.views.iter().flat_map(|v| weights(dataset, v, strongest, settings.noise_scale));
+        targets.weight = SharedImages::new(weights.collect(), slots.clone(), dataset.n_pixels());
+        let noise = motion.views.iter().flat_map(|v| v.background.noise.values.iter().map(|s| share(*s)));
+        targets.noise = SharedImages::new(noise.collect(), slots, dataset.n_pixels());
         targets.rest_phase = targets.phase_that_shows_most();
-        targets.max.clone_from(&targets.high);
         let own = |view: usize, change: &Image| {
             let [width, height] = dataset.views[view].size;
             Image { width, height, values: dataset.own(view, &change.values).into_owned() }
         };
-        let changes =
-            |v: &ViewEvidence| v.background.changes.iter().flatten().map(|c| own(v.view, c)).collect::<Vec<_>>();
-        let changes: Vec<Image> = motion.views.iter().flat_map(changes).collect();
-        let width = vessel_width(changes.iter(), strongest as f32);
+        let changes = motion.views.iter().flat_map(|v| v.background.changes.iter().flatten().map(|c| own(v.view, c)));
+        let width = vessel_width(changes, strongest as f32);
         let mut sides: Vec<usize> =
             motion.views.iter().map(|v| dataset.views[v.view].size).map(|s| s[0].min(s[1])).collect();
         sides.sort_unstable();
-        targets.lengths = Lengths::new(sides[sides.len() / 2], width, &targets.noise, settings.min_scale);
+        targets.lengths = Lengths::new(sides[sides.len() / 2], width, targets.noise.median(), settings.min_scale);
         let place = |c: &HullCell| PossibleVessel {
             position: motion.hull.centre(c.index) / units.pixel,
             evidence: f64::from(c.evidence),
@@ -251,6 +257,12 @@ impl Targets {
     /// Number of phases that some view has.
     pub fn phases_seen(&self) -> usize {
         self.image_of.chunks(self.n_views).filter(|row| row.iter().any(Option::is_some)).count()
+    }
+
+    /// Number of phases of the view that has the fewest.
+    pub fn fewest_phases(&self) -> usize {
+        let phases = |view: usize| self.image_of.iter().skip(view).step_by(self.n_views).flatten().count();
+        (0..self.n_views).map(phases).min().unwrap_or(0)
     }
 
     /// Pixels of an image.

@@ -4,6 +4,7 @@ use crate::gaussians::field::Units;
 use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry};
 use crate::methods::dynamic_gaussians::lengths::Lengths;
+use crate::methods::dynamic_gaussians::shared_images::SharedImages;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
 /// Columns and rows.
@@ -36,10 +37,10 @@ pub fn targets(images: &[f32], n_views: usize) -> Targets {
         image_of: (0..n_images).map(Some).collect(),
         n_images,
         images: images.to_vec(),
-        max: low.iter().map(|v| v + 1.0).collect(),
+        max: None,
         high: low.iter().map(|v| v + 1.0).collect(),
-        weight: vec![1.0; low.len()],
-        noise: vec![0.01; low.len()],
+        weight: SharedImages::of_each(vec![1.0; low.len()], SIDE * SIDE),
+        noise: SharedImages::of_each(vec![0.01; low.len()], SIDE * SIDE),
         contrast: vec![1.0; n_images],
         low,
         lengths: Lengths { factor: 1.0, smoothing: 1.0 },

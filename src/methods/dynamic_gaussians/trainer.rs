@@ -30,6 +30,8 @@ pub struct GaussiansFit {
     fields: FieldsFit,
     /// Whether, since the last call of [`Fit::new_objective`], the static field or the fit to all pixels has begun.
     has_new_objective: bool,
+    /// Findings about the data that were not taken yet.
+    findings: Vec<String>,
 }
 
 impl GaussiansFit {
@@ -77,8 +79,8 @@ impl GaussiansFit {
             Some(fit) => fit.step(),
             None => saved_fields.map_or(0, |saved| saved.step()),
         };
-        let fields = FieldsFit::new(gpu, fields, start.tuning.clone(), saved_fields, done)?;
-        let fit = GaussiansFit {
+        let fields = FieldsFit::awaiting_images(gpu, fields, start.tuning.clone(), saved_fields, done)?;
+        let mut fit = GaussiansFit {
             gpu: gpu.clone(),
             gaussians,
             feed: Arc::new(Mutex::new((0, shown.cloned().unwrap_or(field)))),
@@ -86,10 +88,11 @@ impl GaussiansFit {
             shots,
             fields,
             has_new_objective: false,
+            findings: Vec::new(),
         };
         // A field that was fitted before has left its images already.
         if fit.gaussians.is_none() {
-            fit.fields.set_images(&fit.remaining_images()?)?;
+            fit.set_remaining_images()?;
         }
         Ok(fit)
     }
@@ -109,6 +112,7 @@ impl GaussiansFit {
         let Some(fit) = &mut self.gaussians else { return Ok(Vec::new()) };
         let was_coarse = fit.is_coarse();
         let losses = fit.advance(until.min(end))?;
+        self.findings.extend(fit.take_findings());
         self.has_new_objective |= was_coarse && !fit.is_coarse();
         self.shows_earlier &= !fit.is_presentable(end);
         if self.shows_earlier {
@@ -123,17 +127,17 @@ impl GaussiansFit {
         Ok(losses)
     }
 
-    /// Returns the line integrals of the images less those of the Gaussians: `[frame][pixel]`.
-    fn remaining_images(&self) -> Result<Vec<f32>> {
+    /// Gives the static field the line integrals of the images less those of the Gaussians.
+    fn set_remaining_images(&mut self) -> Result<()> {
         let pictures = Pictures::new(&self.gpu, &self.field())?;
         let data = self.fields.data();
         let (width, pixels) = (data.setup.image_width as usize, data.setup.n_pixels as usize);
-        let mut remaining = data.images.clone();
-        for (shot, image) in self.shots.iter().zip(remaining.chunks_mut(pixels)) {
+        let (images, shots) = (data.images.clone(), &self.shots);
+        self.fields.set_images(|frame| {
+            let shot = &shots[frame];
             let drawn = pictures.draw_at(&shot.rays, (width, pixels / width), shot.phases)?;
-            image.iter_mut().zip(drawn).for_each(|(y, drawn)| *y -= shot.contrast * drawn);
-        }
-        Ok(remaining)
+            Ok(images[frame].iter().zip(drawn).map(|(y, drawn)| y - shot.contrast * drawn).collect())
+        })
     }
 }
 
@@ -161,7 +165,7 @@ impl Fit for GaussiansFit {
         let end = self.fields.data().config.gaussian_iterations();
         let losses = self.advance_gaussians(until, end)?;
         if self.gaussians.is_none() {
-            self.fields.set_images(&self.remaining_images()?)?;
+            self.set_remaining_images()?;
             self.has_new_objective = true;
         }
         let first = self.fields.step() + 1;
@@ -171,6 +175,10 @@ impl Fit for GaussiansFit {
 
     fn new_objective(&mut self) -> Option<&'static str> {
         std::mem::take(&mut self.has_new_objective).then_some(SMALLER_STEPS)
+    }
+
+    fn take_findings(&mut self) -> Vec<String> {
+        std::mem::take(&mut self.findings)
     }
 
     fn outline(&self) -> FitField {

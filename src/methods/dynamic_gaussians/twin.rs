@@ -99,8 +99,8 @@ pub fn loss_and_gradient(
     let (mut loss, mut residuals) = (0.0, Vec::new());
     for (image, seen) in images.chunks(n).enumerate() {
         let range = image * n..(image + 1) * n;
-        let [low, high, weight] = [&targets.low, &targets.high, &targets.weight].map(|v| &v[range.clone()]);
-        let (value, residual) = gaussians::residual(setup, seen, low, high, weight);
+        let [low, high] = [&targets.low, &targets.high].map(|v| &v[range.clone()]);
+        let (value, residual) = gaussians::residual(setup, seen, low, high, targets.weight.image(image));
         loss += value;
         residuals.push(residual);
     }

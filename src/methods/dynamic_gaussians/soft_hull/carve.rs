@@ -21,6 +21,9 @@ const TRACEABLE_PHASES: usize = 4;
 /// Lower limit of the neighbours' evidence, in units of a single view's strongest evidence against a cell.
 const MIN_SUPPORT: f32 = 2.5;
 
+/// Number of pixels of all images up to which views are analysed beside each other: an analysis takes several times the memory of its images.
+const MAX_VALUES_AT_ONCE: usize = 1 << 23;
+
 /// A cell that may hold a moving vessel.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HullCell {
@@ -56,9 +59,13 @@ impl SoftMotion {
     /// Analyses the training views and carves a cube of half side `half` (world units) into `resolution` (even) cells
     /// along each axis.
     pub fn new(dataset: &Dataset, half: f64, resolution: usize) -> SoftMotion {
-        let series = Series::of(dataset);
-        let views: Vec<ViewEvidence> =
-            series.par_iter().map(|s| ViewEvidence::new(s).on_canvas(dataset.canvas())).collect();
+        let evidence = |view| ViewEvidence::of(Series::of_view(dataset, view)).on_canvas(dataset.canvas());
+        let views = Series::views(dataset);
+        let is_large = views.len() * dataset.n_phases as usize * dataset.n_pixels() > MAX_VALUES_AT_ONCE;
+        let views: Vec<ViewEvidence> = match is_large {
+            true => views.into_iter().map(evidence).collect(),
+            false => views.into_par_iter().map(evidence).collect(),
+        };
         SoftMotion::carved(views, dataset, half, resolution)
     }
 
