@@ -17,6 +17,7 @@ use nertca_vk::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use nertca_vk::methods::dynamic_gaussians::per_phase::GaussianTrainer;
 use nertca_vk::methods::dynamic_gaussians::selftest;
 use nertca_vk::methods::dynamic_gaussians::setup;
+use nertca_vk::methods::dynamic_gaussians::shared_images::SharedImages;
 use nertca_vk::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use nertca_vk::methods::dynamic_gaussians::targets::Targets;
 use nertca_vk::methods::dynamic_gaussians::twin::{DeformableParams, loss_and_gradient};
@@ -162,8 +163,8 @@ impl Golden {
     fn targets(&self) -> Targets {
         let (width, height) = (self.size("width_px"), self.size("height_px"));
         let n_phases = self.size("phases");
-        let mut out =
-            Targets { low: Vec::new(), high: Vec::new(), weight: Vec::new(), ..targets(width, height, n_phases) };
+        let mut weight = Vec::new();
+        let mut out = Targets { low: Vec::new(), high: Vec::new(), ..targets(width, height, n_phases) };
         out.image_of = vec![None; n_phases * ANGLES_DEG.len()];
         out.n_images = 0;
         let missing = [self.case["missing"][0][0].as_u64().unwrap(), self.case["missing"][0][1].as_u64().unwrap()];
@@ -177,9 +178,10 @@ impl Golden {
                 let tensor = |name: &str| self.get(&format!("{name}/{view}/{phase}")).into_iter().map(|v| v as f32);
                 out.low.extend(tensor("low"));
                 out.high.extend(tensor("high"));
-                out.weight.extend(tensor("weight"));
+                weight.extend(tensor("weight"));
             }
         }
+        out.weight = SharedImages::of_each(weight, width * height);
         out
     }
 
