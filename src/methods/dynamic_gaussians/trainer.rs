@@ -120,7 +120,7 @@ impl GaussiansFit {
 
     /// Returns the line integrals of the images less those of the Gaussians: `[frame][pixel]`.
     fn remaining_images(&self) -> Result<Vec<f32>> {
-        let pictures = Pictures::new(&self.gpu, &self.field())?;
+        let pictures = Pictures::as_imaged(&self.gpu, &self.field())?;
         let data = self.fields.data();
         let (width, pixels) = (data.setup.image_width as usize, data.setup.n_pixels as usize);
         let mut remaining = data.images.clone();
