@@ -1,5 +1,6 @@
 //! Contrast that arrives during the acquisition: phase 0 shows nothing, and the reconstruction rests at a later phase.
 
+use crate::known_tree;
 use crate::said::{run, text};
 use crate::shared;
 use nertca_vk::config::{Config, Preset};
@@ -42,6 +43,12 @@ fn a_tree_rests_where_vessels_are_full() {
     let dice = dice_by_phase(&finished);
     // Without fillings the mean of the phases before all is full is 0.5, and that of the others 0.88.
     assert!(mean(&dice[..FULL_FROM]) > 0.85 && mean(&dice[FULL_FROM..]) > 0.9, "{dice:?}");
+
+    let told: Value = serde_json::from_str(&known_tree::ok(&["info", text(&finished), "--json"]).0).unwrap();
+    let filled = told["gaussians"]["filled_share"].as_array().unwrap();
+    let filled: Vec<f64> = filled.iter().map(|share| share.as_f64().unwrap()).collect();
+    assert!(filled[0] < 0.1 && filled[rest] == 1.0, "{filled:?}");
+    assert!(filled[..FULL_FROM + 1].windows(2).all(|pair| pair[0] < pair[1]), "contrast arrives: {filled:?}");
 }
 
 /// Dice of the dynamic field in the validation views, whose vessels are full, mean over the images of each phase.
