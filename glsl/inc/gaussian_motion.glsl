@@ -1,12 +1,6 @@
 // Positions of the Gaussians of the deformable set. The including file must declare `gaussian_setup`, `deformable_setup`,
 // `motion_grid`, `own_motion` and `motion_basis`.
-
-// Second phase of a time between two phases: the phase after `phase`, or the one before it if `after_phase` is negative. The
-// beat is periodic.
-uint phase_beyond(uint phase, float after_phase) {
-    uint n = gaussian_setup.n_phases;
-    return (phase + (after_phase < 0.0 ? n - 1u : 1u)) % n;
-}
+#include "inc/phase_beyond.glsl"
 
 // Position in an image taken `after_phase` after a phase: a linear interpolation between the positions at that phase and at the
 // second phase.

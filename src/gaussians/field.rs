@@ -121,7 +121,7 @@ fn density(g: &Gaussian) -> f64 {
 }
 
 /// Returns the total attenuation of a Gaussian, up to a common factor.
-fn mass(g: &Gaussian, setup: &GaussianSetup) -> f64 {
+pub(crate) fn mass(g: &Gaussian, setup: &GaussianSetup) -> f64 {
     density(g) * scales(g, setup).element_product()
 }
 
@@ -149,6 +149,9 @@ pub struct DeformableGaussians {
     pub grid: Vec<[f32; 4]>,
     /// `[Gaussian][basis function]`: own motion (x, y, z, 0), pixels at the isocentre.
     pub own: Vec<[f32; 4]>,
+    /// `[Gaussian][phase]`: filling, above 0 and at most 1, by which images at that phase show less than the density at rest, where contrast comes or
+    /// goes; none where vessels are full all the time. Drawn vessels are full.
+    pub filling: Option<Vec<f32>>,
 }
 
 /// Gaussians as the dynamic field of a model.
@@ -200,6 +203,15 @@ impl DynamicGaussians {
         match self {
             DynamicGaussians::PerPhase(sets) => sets.at(phases.round() as usize % sets.n_phases).copied().collect(),
             DynamicGaussians::Deformable(deformable) => deformable.at(phases),
+        }
+    }
+
+    /// Returns the Gaussians as images show them at a time counted in phases: filled with contrast as far as it had come. Those of
+    /// [`DynamicGaussians::at_time`] are full.
+    pub fn imaged_at_time(&self, phases: f64) -> Vec<Gaussian> {
+        match self {
+            DynamicGaussians::PerPhase(_) => self.at_time(phases),
+            DynamicGaussians::Deformable(deformable) => deformable.imaged_at(phases),
         }
     }
 
@@ -313,6 +325,38 @@ impl DeformableGaussians {
             ..*g
         };
         self.rest.rows.iter().enumerate().map(moved).collect()
+    }
+
+    /// Returns the filling of Gaussian `index` at a phase, above 0 and at most 1; 1 where vessels are full all the time.
+    pub fn filling_at(&self, index: usize, phase: usize) -> f64 {
+        let n_phases = self.rest.n_phases;
+        self.filling.as_ref().map_or(1.0, |filling| filling[index * n_phases + phase % n_phases].into())
+    }
+
+    /// Returns the share of the set's attenuation that contrast fills at a phase, above 0 and at most 1.
+    pub fn filled_share(&self, phase: usize) -> f64 {
+        let (mut filled, mut all) = (0.0, 0.0);
+        for (i, g) in self.rest.rows.iter().enumerate() {
+            let mass = mass(g, &self.rest.setup);
+            filled += mass * self.filling_at(i, phase);
+            all += mass;
+        }
+        if all > 0.0 { filled / all } else { 1.0 }
+    }
+
+    /// Returns the Gaussians as images show them at a phase, which may be fractional: with the density to which contrast fills them,
+    /// interpolated linearly between phases.
+    pub fn imaged_at(&self, phase: f64) -> Vec<Gaussian> {
+        let mut rows = self.at(phase);
+        if self.filling.is_none() {
+            return rows;
+        }
+        let phase = phase.rem_euclid(self.rest.n_phases as f64);
+        for (i, g) in rows.iter_mut().enumerate() {
+            let [here, beyond] = [0, 1].map(|more| self.filling_at(i, phase as usize + more));
+            g.log_density += (here + (beyond - here) * phase.fract()).ln() as f32;
+        }
+        rows
     }
 
     /// Returns the Gaussians at all phases as a set per phase, for scoring.

@@ -27,8 +27,14 @@ impl DynamicGaussians {
             members.iter().map(DynamicGaussians::deformable).collect::<Option<_>>()?;
         let grid = sets.first()?;
         let own = sets.iter().flat_map(|set| (0..set.rest.rows.len()).flat_map(|i| own_on_grid(set, i, grid)));
+        let is_full = sets.iter().all(|set| set.filling.is_none());
+        let filling = sets.iter().flat_map(|set| match &set.filling {
+            Some(filling) => filling.clone(),
+            None => vec![1.0; set.rest.rows.len() * set.rest.n_phases],
+        });
         Some(DynamicGaussians::Deformable(DeformableGaussians {
             own: own.collect(),
+            filling: (!is_full).then(|| filling.collect()),
             setup: DeformableSetup { n_basis: full_basis(rows.n_phases) as u32, ..grid.setup },
             rest: rows,
             grid: grid.grid.clone(),
@@ -171,7 +177,7 @@ mod tests {
             intensities: None,
             agreement: None,
         };
-        DynamicGaussians::Deformable(DeformableGaussians { rest, setup, grid, own })
+        DynamicGaussians::Deformable(DeformableGaussians { rest, setup, grid, own, filling: None })
     }
 
     #[test]
@@ -191,6 +197,21 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn gaussians_of_the_mean_keep_their_filling() {
+        let members = [set(1, 4, 2, 0), set(2, 4, 2, 0)].map(|field| {
+            let DynamicGaussians::Deformable(set) = field else { unreachable!() };
+            set
+        });
+        let [full, mut filled] = members;
+        filled.filling = Some((1..=16).map(|i| i as f32 / 16.0).collect());
+        let fields = [full, filled.clone()].map(DynamicGaussians::Deformable);
+        let mean = DynamicGaussians::mean(&fields, 1.0).unwrap();
+        let filling = mean.deformable().unwrap().filling.clone().unwrap();
+        assert!(filling[..16].iter().all(|f| *f == 1.0));
+        assert_eq!(Some(&filling[16..]), filled.filling.as_deref());
     }
 
     #[test]

@@ -45,6 +45,15 @@ struct Key {
     time: u64,
 }
 
+/// Contrast in the vessels of a picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Fill {
+    /// All vessels are full.
+    Full,
+    /// Vessels are filled as in the images of the fit.
+    Imaged,
+}
+
 /// Draws line integrals of a dynamic field that consists of Gaussians, or the blended intensities where nearer Gaussians hide
 /// those behind them.
 pub struct Pictures {
@@ -54,6 +63,7 @@ pub struct Pictures {
     show: Stage<push::GaussianPicture>,
     /// Stages for Gaussians of which nearer ones hide those behind them; none where line integrals add up.
     blend: Option<BlendKernels>,
+    fill: Fill,
     state: Mutex<State>,
 }
 
@@ -103,10 +113,23 @@ impl Pictures {
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
     pub fn new(gpu: &Gpu, field: &DynamicGaussians) -> Result<Pictures> {
+        Pictures::filled(gpu, field, Fill::Full)
+    }
+
+    /// Prepares to draw a field as the images of its fit show it, with vessels that are filled as far as contrast had come.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn as_imaged(gpu: &Gpu, field: &DynamicGaussians) -> Result<Pictures> {
+        Pictures::filled(gpu, field, Fill::Imaged)
+    }
+
+    fn filled(gpu: &Gpu, field: &DynamicGaussians, fill: Fill) -> Result<Pictures> {
         let state = Mutex::new(State::new(field));
         let project = Build::default().stage(gpu)?;
         let blend = field.rows().intensities.as_ref().map(|_| BlendKernels::new(gpu)).transpose()?;
-        Ok(Pictures { gpu: gpu.clone(), project, splat: SplatStage::new(gpu)?, show: into_buffers(gpu)?, blend, state })
+        let (splat, show) = (SplatStage::new(gpu)?, into_buffers(gpu)?);
+        Ok(Pictures { gpu: gpu.clone(), project, splat, show, blend, fill, state })
     }
 
     /// Replaces the field to be drawn.
@@ -223,7 +246,11 @@ impl Pictures {
     fn record(&self, field: &DynamicGaussians, key: Key) -> Result<Picture> {
         let (gpu, sets) = (&self.gpu, field.rows());
         let (width, height) = (key.columns, key.rows);
-        let rows = field.at_time(f64::from_bits(key.time));
+        let time = f64::from_bits(key.time);
+        let rows = match self.fill {
+            Fill::Full => field.at_time(time),
+            Fill::Imaged => field.imaged_at_time(time),
+        };
         let n = rows.len() as u32;
         let pixels = (width * height) as u32;
         let setup = GaussianSetup {

@@ -59,10 +59,15 @@ struct GridHeader {
     /// Rest phase, at which Gaussians are at their stored positions.
     #[serde(default)]
     rest_phase: u32,
+    /// True where each Gaussian has a filling at each phase.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    filling: bool,
 }
 
 /// Name of the tensor of blended Gaussians' intensities.
 const INTENSITY: &str = "gaussians.intensity";
+/// Name of the tensor of fillings.
+const FILLING: &str = "gaussians.filling";
 
 pub(crate) fn header(field: &DynamicGaussians) -> GaussianHeader {
     let sets = field.rows();
@@ -84,6 +89,7 @@ pub(crate) fn header(field: &DynamicGaussians) -> GaussianHeader {
                 half_side: deformable.setup.half_side,
                 basis: deformable.setup.n_basis,
                 rest_phase: deformable.setup.rest_phase,
+                filling: deformable.filling.is_some(),
             }),
         },
     }
@@ -119,6 +125,10 @@ pub(crate) fn tensors(field: &DynamicGaussians) -> Vec<FileTensor> {
             let (n, basis) = (deformable.setup.n_nodes as usize, deformable.setup.n_basis as usize);
             all.push(vectors("motion.grid", vec![deformable.rest.n_phases, n, n, n, 3], &deformable.grid));
             all.push(vectors("motion.own", vec![rows.len(), basis, 3], &deformable.own));
+            if let Some(filling) = &deformable.filling {
+                let bytes = filling.iter().flat_map(|v| v.to_le_bytes()).collect();
+                all.push((FILLING.into(), Dtype::F32, vec![rows.len(), deformable.rest.n_phases], bytes));
+            }
         }
     }
     all
@@ -207,6 +217,10 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
         let values = file.floats(name, shape)?;
         Ok(values.chunks_exact(3).map(|v| [v[0], v[1], v[2], 0.0]).collect())
     };
+    let filling = grid.filling.then(|| file.floats(FILLING, &[Some(n), Some(n_phases)])).transpose()?;
+    if let Some(bad) = filling.iter().flatten().find(|v| !(**v > 0.0 && **v <= 1.0)) {
+        return Err(Error::data(path, FILLING, format!("has the value {bad}, but fillings are above 0 and at most 1")));
+    }
     Ok(DynamicGaussians::Deformable(DeformableGaussians {
         setup: DeformableSetup {
             n_nodes: grid.nodes,
@@ -218,6 +232,7 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
         },
         grid: vectors("gaussians.motion.grid", &[Some(n_phases), nodes, nodes, nodes, Some(3)])?,
         own: vectors("gaussians.motion.own", &[Some(n), Some(grid.basis as usize), Some(3)])?,
+        filling,
         rest: sets,
     }))
 }

@@ -38,6 +38,7 @@ impl DeformableGaussians {
         DeformableGaussians {
             grid: grid.map(|(phase, i)| at(phase, i)).collect(),
             own: self.own.iter().map(|v| pack(vector(v))).collect(),
+            filling: self.filling.clone(),
             rest,
             setup,
         }
@@ -92,6 +93,7 @@ mod tests {
             setup,
             grid: (0..N_PHASES).flat_map(|t| (0..125).map(move |i| pack(displacement(t, node(i))))).collect(),
             own: (0..8).map(|i| [0.1 * i as f32, -0.3, 0.2, 0.0]).collect(),
+            filling: Some((0..4 * N_PHASES).map(|i| 0.05 * i as f32).collect()),
         }
     }
 
@@ -107,6 +109,7 @@ mod tests {
                 assert!(was.distance(is) < 1e-6, "Gaussian {i} at phase {phase}: {is}, not {was}");
             }
         }
+        assert_eq!(other.filling, deformable.filling);
         for (was, is) in deformable.rest.rows.iter().zip(&other.rest.rows) {
             let width = |g, of: &DeformableGaussians| scales(g, &of.rest.setup) * of.rest.units.pixel;
             let density =

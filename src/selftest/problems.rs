@@ -189,6 +189,7 @@ pub fn targets(width: usize, height: usize, n_phases: usize) -> Result<Targets> 
         rest_phase: 0,
         images: all.clone().map(|i| 1.0 + wave(i, 0.37)).collect(),
         max: Some(all.clone().map(|i| 1.0 + wave(i, 0.37)).collect()),
+        contrast_comes_and_goes: false,
         places: vec![Vec::new(); n_phases],
         cell: 1.0,
     })
@@ -248,7 +249,13 @@ pub fn deformable_set(rows: &[Gaussian], deformable: &DeformableSetup, n_phases:
     let rests = |i: usize| i / nodes == deformable.rest_phase as usize;
     let grid = (0..n_phases * nodes).map(|i| if rests(i) { DVec3::ZERO } else { wave(i, 0.61) }).collect();
     let own = (0..rows.len() * deformable.n_basis as usize).map(|i| 0.5 * wave(i, 0.47)).collect();
-    DeformableParams { rows: rows.iter().map(params).collect(), own, grid }
+    DeformableParams { rows: rows.iter().map(params).collect(), own, grid, filling: Vec::new() }
+}
+
+/// Fillings of `n` Gaussians, `[Gaussian][phase]`, full at the rest phase.
+pub fn fillings(n: usize, n_phases: usize, rest_phase: usize) -> Vec<f64> {
+    let value = |i: usize| if i % n_phases == rest_phase { 1.0 } else { 0.5 + 0.45 * (0.83 * i as f64).sin() };
+    (0..n * n_phases).map(|i| f64::from(value(i) as f32)).collect()
 }
 
 /// Pixel at the isocentre and strongest change of [`drawn_fields`], world units.
@@ -294,7 +301,7 @@ fn drawn_deformable(n: usize, n_phases: u32) -> DeformableGaussians {
     let grid = (0..n_phases as usize * 64).map(|i| if rests(i) { [0.0; 4] } else { vector(i) }).collect();
     let mut rest = drawn_set(n, 1);
     (rest.n_phases, rest.setup.n_phases) = (n_phases as usize, n_phases);
-    DeformableGaussians { rest, setup, grid, own: (0..n * 4).map(vector).collect() }
+    DeformableGaussians { rest, setup, grid, own: (0..n * 4).map(vector).collect(), filling: None }
 }
 
 /// Dynamic fields of three phases to be drawn, one of each form.

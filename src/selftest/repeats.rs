@@ -8,6 +8,7 @@ use crate::kernels::layout::Gaussian;
 use crate::kernels::tuning::Tuning;
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
+use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::Findings;
@@ -84,15 +85,29 @@ pub fn compare_gaussians(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
         Ok(bits)
     };
     compare_runs(run, findings)?;
-    findings.begin("deformable", "24 iterations, losses, Gaussians and their motion");
     let (targets, rows, config) = deformable_case()?;
     let config = Config { gaussians: settings(config.clone()), ..config };
+    findings.begin("deformable", "24 iterations, losses, Gaussians and their motion");
+    compare_deformable(gpu, &targets, &rows, &config, findings)?;
+    findings.begin("deformable", "the same with contrast that comes and goes, and fillings");
+    compare_deformable(gpu, &Targets { contrast_comes_and_goes: true, ..targets }, &rows, &config, findings)
+}
+
+/// Compares runs of one set that moves.
+fn compare_deformable(
+    gpu: &Gpu,
+    targets: &Targets,
+    rows: &[Gaussian],
+    config: &Config,
+    findings: &mut Findings,
+) -> Result<()> {
     let run = |stops: &[u32]| -> Result<Vec<u64>> {
-        let mut trainer = DeformableTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
+        let mut trainer = DeformableTrainer::with(gpu, targets.clone(), config, &Particles::fresh(rows.to_vec()))?;
         let mut bits = losses(stops, |stop| trainer.advance(stop))?;
         let deformable = trainer.deformable()?;
         bits.extend(bits_of(&deformable.rest.rows));
-        bits.extend(deformable.grid.iter().chain(&deformable.own).flatten().map(|v| u64::from(v.to_bits())));
+        let motion = deformable.grid.iter().chain(&deformable.own).flatten();
+        bits.extend(motion.chain(deformable.filling.iter().flatten()).map(|v| u64::from(v.to_bits())));
         Ok(bits)
     };
     compare_runs(run, findings)

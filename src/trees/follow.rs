@@ -100,6 +100,7 @@ mod tests {
             },
             grid: (0..2).flat_map(|t| vec![[1.0, 2.0, 3.0, 0.0].map(|v: f32| v * t as f32); 64]).collect(),
             own: vec![[0.0; 4], [0.0; 4], [0.0, 0.0, -2.0, 0.0], [0.0; 4]],
+            filling: None,
         }
     }
 

@@ -97,6 +97,7 @@ fn tree() -> DeformableGaussians {
         },
         grid: (0..PHASES).flat_map(|t| (0..n.pow(3)).map(move |i| pack(displacement(node(i), t)))).collect(),
         own: (0..6).flat_map(|i| own(i).map(pack)).collect(),
+        filling: None,
     }
 }
 

@@ -47,6 +47,8 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("gaussian_update", wrong_sign, gaussians::compare),
         fault("gaussian_report", no_stores, gaussians::compare),
         fault("deformable_grid_gradient", wrong_sign, deformable::compare),
+        fault("deformable_fill", sum_for_product, deformable::compare),
+        fault("deformable_filling", sum_for_product, deformable::compare),
         fault("march_count", difference_for_sum, an_iteration),
         fault("march_scan", differences, an_iteration),
         fault("march_emit", difference_for_sum, an_iteration),

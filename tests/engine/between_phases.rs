@@ -4,6 +4,7 @@ use crate::common;
 use crate::common::{gpu, tuning};
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::fields::data::FieldData;
+use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::gaussians::pictures::Pictures;
 use nertca_vk::methods::dynamic_gaussians::data::GaussianData;
 use nertca_vk::plan::Plan;
@@ -77,6 +78,29 @@ fn a_moving_tree_is_fitted_to_frames_at_their_own_time() {
         let own_time = if frame.phase == 1 { (1, 2, 0.25) } else { (frame.phase, (frame.phase + 1) % 3, 0.0) };
         assert_eq!((row.phase, row.beyond, row.beyond_share), own_time);
     }
+}
+
+#[test]
+fn pictures_are_full_or_filled_as_images_are() {
+    const FILLING: [f32; 3] = [1.0, 0.5, 0.2];
+    let gpu = gpu();
+    let dataset = common::small_dataset(37, 29);
+    let rays = &dataset.views[1].rays;
+    let [_, full] = drawn_fields();
+    let Some(mut set) = full.deformable().cloned() else { unreachable!() };
+    set.filling = Some((0..set.rest.rows.len()).flat_map(|_| FILLING).collect());
+    let field = DynamicGaussians::Deformable(set);
+    let [plain, shown] = [&full, &field].map(|field| Pictures::new(&gpu, field).unwrap());
+    let imaged = Pictures::as_imaged(&gpu, &field).unwrap();
+    for (time, share) in [(0.0, 1.0), (1.0, 0.5), (1.4, 0.38), (2.5, 0.6)] {
+        let [plain, shown, imaged] = [&plain, &shown, &imaged].map(|p| p.draw_at(rays, (37, 29), time).unwrap());
+        assert_eq!(shown, plain, "time {time}: drawn vessels are full");
+        let max = plain.iter().fold(0f32, |max, v| max.max(*v));
+        let worst = imaged.iter().zip(&plain).map(|(a, b)| (a - share * b).abs() / max).fold(0.0, f32::max);
+        assert!(worst < 1e-4 && max > 0.1, "time {time}: {worst}");
+    }
+    drop((plain, shown, imaged));
+    common::expect_silence(gpu);
 }
 
 #[test]

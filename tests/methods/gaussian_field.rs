@@ -7,7 +7,7 @@ use nertca_vk::checkpoint::{self, Checkpoint};
 use nertca_vk::config::{AdjustMode, Config, Preset, sections};
 use nertca_vk::error::Error;
 use nertca_vk::fields::state::FieldsState;
-use nertca_vk::gaussians::field::{DynamicGaussians, Gaussians};
+use nertca_vk::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::DeviceState;
 use nertca_vk::methods::dynamic_gaussians::trainer::GaussiansFit;
@@ -85,11 +85,38 @@ fn bounds_hold_all_around_their_points() {
     expect_silence(gpu);
 }
 
+/// A deformable set with fillings.
+fn filled_field() -> DynamicGaussians {
+    let [_, DynamicGaussians::Deformable(mut set)] = drawn_fields() else { unreachable!() };
+    let value = |i: usize| 0.55 + 0.45 * (0.7 * i as f32).sin();
+    set.filling = Some((0..set.rest.rows.len() * set.rest.n_phases).map(value).collect());
+    DynamicGaussians::Deformable(set)
+}
+
+#[test]
+fn impossible_fillings_are_refused_by_name() {
+    let gpu = gpu();
+    let model = model(&gpu, &common::small_dataset(13, 11), filled_field());
+    let state = FieldsState::fresh(model.step, model.param_map.len);
+    for bad in [-0.1, 0.0, 1.2, f32::NAN] {
+        let mut model = model.clone();
+        if let Some(DynamicGaussians::Deformable(DeformableGaussians { filling: Some(filling), .. })) =
+            &mut model.gaussians
+        {
+            filling[5] = bad;
+        }
+        let saved = Checkpoint { model, fit: Arc::new(state.clone()), data_fingerprint: String::new() };
+        let refused = Checkpoint::from_bytes(&saved.to_bytes().unwrap(), Path::new("test")).err().unwrap().to_string();
+        assert!(refused.contains("gaussians.filling"), "{bad}: {refused}");
+    }
+    expect_silence(gpu);
+}
+
 #[test]
 fn checkpoints_keep_every_bit() {
     let gpu = gpu();
     let dataset = common::small_dataset(13, 11);
-    for field in drawn_fields() {
+    for field in drawn_fields().into_iter().chain([filled_field()]) {
         let model = model(&gpu, &dataset, field);
         let moments = vec![[0.25, 0.5]; model.param_map.len];
         let state = FieldsState { moments, ..FieldsState::fresh(model.step, 0) };
@@ -100,6 +127,8 @@ fn checkpoints_keep_every_bit() {
         for phase in 0..3 {
             let at = |c: &Checkpoint| c.model.gaussians.as_ref().unwrap().at(phase);
             assert_eq!(at(&read), at(&saved));
+            let imaged = |c: &Checkpoint| c.model.gaussians.as_ref().unwrap().imaged_at_time(phase as f64 + 0.25);
+            assert_eq!(imaged(&read), imaged(&saved));
         }
         let statics = saved.model.param_map.static_len;
         assert_eq!(read.model.params[..statics], saved.model.params[..statics]);

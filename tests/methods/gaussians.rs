@@ -27,7 +27,7 @@ use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk::score::metrics;
 use nertca_vk::selftest::gaussians::{self, TENSORS, device_gradient, numbers, twin};
 use nertca_vk::selftest::problems::{
-    self, ANGLES_DEG, deformable_case, deformable_set, random_gaussians, units, with_gaussians,
+    self, ANGLES_DEG, deformable_case, deformable_set, fillings, random_gaussians, units, with_gaussians,
 };
 use nertca_vk::vessels::threshold::VESSEL_SHARE;
 use std::time::Instant;
@@ -464,7 +464,8 @@ fn tree_twin_gradient_is_the_derivative_of_its_loss() {
     let (targets, rows, Config { deformable: settings, .. }) = deformable_case().unwrap();
     let setup = GaussianSetup { cut: 12.0, ..setup::gaussian_setup(&targets, &config().gaussians) };
     let tree = setup::deformable_setup(&targets, &settings);
-    let p = deformable_set(&rows[..7], &tree, targets.n_phases);
+    let mut p = deformable_set(&rows[..7], &tree, targets.n_phases);
+    p.filling = fillings(7, targets.n_phases, targets.rest_phase);
     let (_, _, gradient) = loss_and_gradient(&targets, &setup, &tree, &p);
     let check = |what: &str, want: f64, change: &dyn Fn(&mut DeformableParams, f64)| {
         let loss = |h: f64| {
@@ -488,7 +489,11 @@ fn tree_twin_gradient_is_the_derivative_of_its_loss() {
     for i in 0..7 {
         seen += usize::from(check("log-scale", gradient.rows[i][5], &|p, h| p.rows[i][5] += h));
     }
-    assert!(seen > 10, "the case must have gradients");
+    let mut filled = 0;
+    for i in (0..p.filling.len()).filter(|i| i % targets.n_phases != targets.rest_phase) {
+        filled += usize::from(check("filling", gradient.filling[i], &|p, h| p.filling[i] += h));
+    }
+    assert!(seen > 10 && filled > 10, "the case must have gradients");
     assert!(gradient.grid[rest].iter().all(|g| *g == DVec3::ZERO), "the grid rests at a phase");
 }
 

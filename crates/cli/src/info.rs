@@ -85,11 +85,13 @@ struct Stored<'a>(#[serde(serialize_with = "path_in_json::serialize")] &'a Path)
 
 fn describe_gaussians(field: &DynamicGaussians) -> serde_json::Value {
     let phases = 0..field.rows().n_phases;
+    let filled = field.deformable().filter(|set| set.filling.is_some());
     serde_json::json!({
         "form": field.form().name(),
         "count": field.rows().rows.len(),
         "bytes": field.bytes(),
         "rest_phase": field.deformable().map(|set| set.setup.rest_phase),
+        "filled_share": filled.map(|set| phases.clone().map(|p| set.filled_share(p)).collect::<Vec<_>>()),
         "displacement_from_phase_0": field.deformable().map(|set| phases.map(|p| set.displacement(p as f64)).collect::<Vec<_>>()),
     })
 }

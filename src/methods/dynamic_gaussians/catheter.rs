@@ -154,7 +154,7 @@ mod tests {
         };
         // Own motion with one harmonic: its cosine and its sine.
         let own = all.iter().flat_map(|(_, motion)| [[0.0; 4], [0.0, *motion as f32, 0.0, 0.0]]).collect();
-        DeformableGaussians { grid: vec![[0.0; 4]; PHASES * setup.nodes()], rest, setup, own }
+        DeformableGaussians { filling: None, grid: vec![[0.0; 4]; PHASES * setup.nodes()], rest, setup, own }
     }
 
     /// A line from the ostium, the first Gaussian of the vessel, whose motion ends along it.

@@ -80,6 +80,13 @@ fn hull_and_targets(config: &Config, dataset: &Dataset, notes: &mut Vec<String>)
     notes.extend(wide_hull(&soft, dataset));
     notes.extend(idle_iterations(config));
     notes.push(match form {
+        GaussianForm::Deformable if targets.contrast_comes_and_goes => format!(
+            "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"deformable\"), starting from \
+             phase {}, which shows most of the vessels; contrast agent flows in or out during the beat, so each Gaussian \
+             has a filling at each phase, and the motion of vessels without contrast is estimated from the others and from \
+             other phases",
+            targets.rest_phase
+        ),
         GaussianForm::Deformable => match targets.rest_phase {
             0 => "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"deformable\")".into(),
             phase => format!(
@@ -87,7 +94,7 @@ fn hull_and_targets(config: &Config, dataset: &Dataset, notes: &mut Vec<String>)
                  phase {phase}, which shows more of the vessels than phase 0"
             ),
         },
-        _ if targets.contrast_comes_and_goes() => {
+        _ if targets.contrast_comes_and_goes => {
             "each phase has its own set of Gaussians (gaussians.form = \"phase\"), because contrast agent flows in or \
              out during the beat"
                 .into()

@@ -15,6 +15,8 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup, GaussianView};
 use crate::methods::dynamic_gaussians::catheter::Catheter;
+use crate::methods::dynamic_gaussians::filling::{Filling, FillingBuffers, from_set_of_phase};
+use crate::methods::dynamic_gaussians::members::{MemberBuffers, Members};
 use crate::methods::dynamic_gaussians::per_phase::{MAX_PASSES, check_count, strong};
 use crate::methods::dynamic_gaussians::pruning::{Judge, short_components};
 use crate::methods::dynamic_gaussians::stages::{
@@ -27,10 +29,18 @@ use crate::methods::dynamic_gaussians::target_buffers::{
     Renewal, TargetPart, divided_targets, n_loss_parts, padded, renew_bounds, take_images,
 };
 use crate::methods::dynamic_gaussians::targets::Targets;
+use crate::methods::dynamic_gaussians::unseen::{complete, complete_phase, is_well_seen};
 use crate::methods::dynamic_gaussians::{seeds, setup};
 use crate::model::groups::vessels;
 use crate::raster::Image;
 use glam::DVec3;
+
+/// Reach of the estimate of fillings at a phase before it is tracked, pixels of the settings.
+const GUESS_REACH: f64 = 3.0;
+/// Reach of the estimate of fillings at a phase that has been tracked, pixels of the settings.
+const TRACKED_REACH: f64 = 2.0;
+/// Minimum filling at the phases whose images decide where new Gaussians are placed.
+const MOSTLY_FILLED: f64 = 0.5;
 
 /// A run on a device.
 pub struct DeformableTrainer {
@@ -39,8 +49,7 @@ pub struct DeformableTrainer {
     config: Config,
     kernels: (GaussianKernels, DeformableKernels),
     joint: Fit,
-    particles: ParticleBuffers,
-    own: OwnMotionBuffers,
+    members: MemberBuffers,
     n: u32,
     iterations: Iterations,
     step: u32,
@@ -100,12 +109,12 @@ impl Fit {
     }
 
     /// Returns the buffers of the Gaussians with moments of the splats of a single part of the images, where there are several parts.
-    fn scratch(&self, gpu: &Gpu, (particles, _): Bound<'_>, n: u32) -> Result<ParticleBuffers> {
+    fn scratch(&self, gpu: &Gpu, members: &MemberBuffers, n: u32) -> Result<ParticleBuffers> {
         let splats = |part: &TargetPart| part.phases.len() as u64 * u64::from(self.setup.n_views * n);
         if self.parts.len() == 1 {
-            return Ok(particles.clone());
+            return Ok(members.particles.clone());
         }
-        particles.with_moments(gpu, self.parts.iter().map(splats).max().unwrap_or(0))
+        members.particles.with_moments(gpu, self.parts.iter().map(splats).max().unwrap_or(0))
     }
 
     /// Records one iteration; `scratch` is that of [`Fit::scratch`].
@@ -134,8 +143,10 @@ impl DeformableTrainer {
         let kernels = (GaussianKernels::new(gpu)?, DeformableKernels::new(gpu)?);
         let joint = Fit::joint(gpu, &targets, config)?;
         let own = OwnMotion::fresh(vec![[0.0; 4]; n as usize * joint.deformable.n_basis as usize]);
-        let (particles, own) = upload(gpu, &joint.setup, particles, &own)?;
-        let iterations = record(gpu, &kernels, &joint, (&particles, &own), n, config.train.iterations_per_submit)?;
+        let full = || Filling::fresh(vec![1.0; n as usize * targets.n_phases]);
+        let filling = targets.contrast_comes_and_goes.then(full);
+        let members = Members { particles: particles.clone(), own, filling }.upload(gpu, &joint.setup)?;
+        let iterations = record(gpu, &kernels, &joint, &members, n, config.train.iterations_per_submit)?;
         let (gpu, config) = (gpu.clone(), config.clone());
         Ok(DeformableTrainer {
             gpu,
@@ -143,8 +154,7 @@ impl DeformableTrainer {
             config,
             kernels,
             joint,
-            particles,
-            own,
+            members,
             n,
             iterations,
             step: 0,
@@ -158,22 +168,54 @@ impl DeformableTrainer {
         self.joint.tracking(&self.gpu, &self.targets, &self.targets.deformable(&self.config.deformable))
     }
 
-    /// Tracks the grid to a phase from those before it, on blurred images, in submits as long as those of the fit.
-    pub(super) fn track(&self, tracking: &Fit, track: &Track) -> Result<()> {
+    /// Tracks the grid to a phase from those before it, on blurred images, in submits as long as those of the fit. Where contrast comes or
+    /// goes, `of_phase` is a set of Gaussians that was fitted to this phase alone.
+    pub(super) fn track(&self, tracking: &Fit, track: &Track, of_phase: Option<&[Gaussian]>) -> Result<()> {
         let submit = |record: &dyn Fn(&mut DeformablePass<'_>) -> Result<()>| -> Result<()> {
             let mut recording = Recording::new(&self.gpu, "tracking")?;
-            let bound = (&self.particles, &self.own);
-            record(&mut pass(&mut recording, &self.kernels, tracking, bound, self.n))?;
+            record(&mut pass(&mut recording, &self.kernels, tracking, &self.members, self.n))?;
             Ok(self.gpu.wait(recording.finish()?.submit()?)?)
         };
         submit(&|pass| record_guess(pass, track))?;
+        if let Some(of_phase) = of_phase {
+            self.estimate_filling(track.phase, of_phase, GUESS_REACH)?;
+        }
         let mut left = if track.images.is_empty() { 0 } else { self.config.deformable.track_iterations };
         while left > 0 {
             let n = left.min(self.config.train.iterations_per_submit);
             submit(&|pass| record_track(pass, track, n))?;
             left -= n;
         }
+        if let Some(of_phase) = of_phase {
+            self.estimate_filling(track.phase, of_phase, TRACKED_REACH)?;
+            self.complete_motion(Some(track))?;
+        }
         Ok(())
+    }
+
+    /// Estimates the filling at a phase from the set of Gaussians of this phase alone; `reach` is that of [`from_set_of_phase`] in pixels
+    /// of the settings. At the rest phase vessels are full.
+    fn estimate_filling(&self, phase: u32, of_phase: &[Gaussian], reach: f64) -> Result<()> {
+        let Some(buffers) = &self.members.filling else { return Ok(()) };
+        let deformable = self.deformable()?;
+        let Some(mut values) = deformable.filling.clone() else { return Ok(()) };
+        let moved = deformable.at(phase.into());
+        let reach = reach * self.targets.lengths.factor;
+        let estimated = from_set_of_phase(&moved, of_phase, &self.joint.setup, reach);
+        let of_phase = values.iter_mut().skip(phase as usize).step_by(self.targets.n_phases);
+        of_phase.zip(estimated).for_each(|(value, estimated)| *value = estimated);
+        Ok(self.gpu.upload(&buffers.filling, 0, &values)?)
+    }
+
+    /// Completes the motion of vessels that contrast does not show: at a phase that was tracked from those before it, or at all phases.
+    fn complete_motion(&self, tracked: Option<&Track>) -> Result<()> {
+        let mut deformable = self.deformable()?;
+        match tracked {
+            Some(track) if is_well_seen(&deformable, track.phase as usize) => return Ok(()),
+            Some(track) => complete_phase(&mut deformable, track.phase as usize, &track.known),
+            None => complete(&mut deformable),
+        }
+        Ok(self.gpu.upload(&self.joint.grid.motion_grid, 0, &deformable.grid)?)
     }
 
     /// Clears the optimiser's momentum, so that iterations after tracking begin without it.
@@ -213,7 +255,10 @@ impl DeformableTrainer {
     /// go on from `step`.
     pub(super) fn move_as(&mut self, deformable: &DeformableGaussians, step: u32) -> Result<()> {
         self.gpu.upload(&self.joint.grid.motion_grid, 0, &deformable.grid)?;
-        self.gpu.upload(&self.own.own_motion, 0, &deformable.own)?;
+        self.gpu.upload(&self.members.own.own_motion, 0, &deformable.own)?;
+        if let (Some(buffers), Some(filling)) = (&self.members.filling, &deformable.filling) {
+            self.gpu.upload(&buffers.filling, 0, filling)?;
+        }
         self.step = step;
         Ok(self.gpu.upload(&self.joint.targets.gaussian_step, 0, &[self.step])?)
     }
@@ -230,7 +275,7 @@ impl DeformableTrainer {
 
     /// The Gaussians on the device, for rendering while training and for tests.
     pub fn particles(&self) -> &ParticleBuffers {
-        &self.particles
+        &self.members.particles
     }
 
     /// Target buffers on the device, for tests.
@@ -245,7 +290,12 @@ impl DeformableTrainer {
 
     /// Own motion on the device, as [`DeformableTrainer::particles`].
     pub fn own_motion(&self) -> &OwnMotionBuffers {
-        &self.own
+        &self.members.own
+    }
+
+    /// Filling on the device, as [`DeformableTrainer::particles`]; none where vessels are full all the time.
+    pub fn filling(&self) -> Option<&FillingBuffers> {
+        self.members.filling.as_ref()
     }
 
     /// Returns the use of the bounds that are renewed now: the host keeps no bounds of large images that it does not need.
@@ -291,6 +341,9 @@ impl DeformableTrainer {
                 self.find_catheter()?;
             }
         }
+        if self.step == self.config.gaussians.iterations && self.members.filling.is_some() {
+            self.complete_motion(None)?;
+        }
         losses(&self.gpu, &self.joint.targets.gaussian_ring, first..self.step, SMALLER_STEPS)
     }
 
@@ -298,19 +351,26 @@ impl DeformableTrainer {
     /// host, as with a set per phase.
     fn grow(&mut self) -> Result<()> {
         let (weakest, setup) = (self.config.gaussians.prune_threshold, self.joint.setup);
-        let (mut particles, mut own) = self.retain(|rows| strong(rows, &setup, weakest))?;
+        let mut members = self.retain(|rows| strong(rows, &setup, weakest))?;
         let deformable = self.deformable()?;
         let carried = |x: DVec3, phase: f64| deformable.carried(x, phase);
+        let is_filled = |x: DVec3, phase: usize| {
+            deformable.filling.is_none() || deformable.filling_at(deformable.nearest(x), phase) >= MOSTLY_FILLED
+        };
         let (settings, seed) = (self.targets.lengths.gaussians(&self.config.gaussians), self.config.seed);
-        let additions = seeds::deformable_additions(&self.targets, &settings, seed, &self.images()?, carried);
-        // New Gaussians move as their nearest neighbours do.
-        let n_basis = self.joint.deformable.n_basis as usize;
+        let additions =
+            seeds::deformable_additions(&self.targets, &settings, seed, &self.images()?, carried, is_filled);
+        // New Gaussians move and are filled as their nearest neighbours.
+        let (n_basis, n_phases) = (self.joint.deformable.n_basis as usize, self.targets.n_phases);
         for g in &additions {
             let nearest = deformable.nearest(DVec3::from_array(g.position.map(f64::from)));
-            own.append(deformable.own[nearest * n_basis..][..n_basis].to_vec());
+            members.own.append(deformable.own[nearest * n_basis..][..n_basis].to_vec());
+            if let (Some(filling), Some(values)) = (&mut members.filling, &deformable.filling) {
+                filling.append(values[nearest * n_phases..][..n_phases].to_vec());
+            }
         }
-        particles.append(additions);
-        self.replace(&particles, &own)
+        members.particles.append(additions);
+        self.replace(&members)
     }
 
     /// Drops Gaussians that are too faint for vessels: they stand for other motion.
@@ -351,22 +411,20 @@ impl DeformableTrainer {
     /// Drops short components that the images do not support.
     fn drop_unsupported(&mut self) -> Result<()> {
         let n = self.n as usize;
-        let particles = self.particles.download(&self.gpu, n)?;
-        let components = short_components(&particles.rows, &self.joint.setup, self.targets.lengths.factor);
+        let members = self.download()?;
+        let components = short_components(&members.particles.rows, &self.joint.setup, self.targets.lengths.factor);
         if components.is_empty() {
             return Ok(());
         }
-        let own = self.own.download(&self.gpu, n * self.joint.deformable.n_basis as usize)?;
         let judge = Judge::new(&self.targets, &self.images()?);
         let mut keep = vec![true; n];
         for component in components {
             let mut member = vec![false; n];
             component.iter().for_each(|i| member[*i] = true);
-            let (mut particles, mut own) = (particles.clone(), own.clone());
-            particles.retain(&member);
-            own.retain(&member);
-            let (particles, own) = upload(&self.gpu, &self.joint.setup, &particles, &own)?;
-            if !judge.supports(&self.images_of((&particles, &own), component.len() as u32)?) {
+            let mut alone = members.clone();
+            alone.retain(&member);
+            let alone = alone.upload(&self.gpu, &self.joint.setup)?;
+            if !judge.supports(&self.images_of(&alone, component.len() as u32)?) {
                 component.iter().for_each(|i| keep[*i] = false);
             }
         }
@@ -378,22 +436,24 @@ impl DeformableTrainer {
     }
 
     /// Keeps some of the Gaussians on the device, and returns them.
-    fn retain(&mut self, kept: impl FnOnce(&[Gaussian]) -> Vec<bool>) -> Result<(Particles, OwnMotion)> {
-        let n = self.n as usize;
-        let mut particles = self.particles.download(&self.gpu, n)?;
-        let mut own = self.own.download(&self.gpu, n * self.joint.deformable.n_basis as usize)?;
-        let keep = kept(&particles.rows);
-        particles.retain(&keep);
-        own.retain(&keep);
-        self.replace(&particles, &own)?;
-        Ok((particles, own))
+    fn retain(&mut self, kept: impl FnOnce(&[Gaussian]) -> Vec<bool>) -> Result<Members> {
+        let mut members = self.download()?;
+        members.retain(&kept(&members.particles.rows));
+        self.replace(&members)?;
+        Ok(members)
     }
 
-    fn replace(&mut self, particles: &Particles, own: &OwnMotion) -> Result<()> {
-        self.n = check_count(particles)?;
-        (self.particles, self.own) = upload(&self.gpu, &self.joint.setup, particles, own)?;
-        let (bound, per_submit) = ((&self.particles, &self.own), self.config.train.iterations_per_submit);
-        self.iterations = record(&self.gpu, &self.kernels, &self.joint, bound, self.n, per_submit)?;
+    /// Reads all Gaussians back.
+    fn download(&self) -> Result<Members> {
+        let n_basis = self.joint.deformable.n_basis as usize;
+        self.members.download(&self.gpu, self.n as usize, n_basis, self.targets.n_phases)
+    }
+
+    fn replace(&mut self, members: &Members) -> Result<()> {
+        self.n = check_count(&members.particles)?;
+        self.members = members.upload(&self.gpu, &self.joint.setup)?;
+        let per_submit = self.config.train.iterations_per_submit;
+        self.iterations = record(&self.gpu, &self.kernels, &self.joint, &self.members, self.n, per_submit)?;
         Ok(())
     }
 
@@ -402,7 +462,7 @@ impl DeformableTrainer {
     /// # Errors
     /// Device errors.
     pub fn images(&self) -> Result<Vec<f32>> {
-        self.images_of((&self.particles, &self.own), self.n)
+        self.images_of(&self.members, self.n)
     }
 
     /// Images of the present field that other `views` see, one for each image of the targets.
@@ -424,11 +484,11 @@ impl DeformableTrainer {
     }
 
     /// Images of `n` Gaussians that move on the present grid.
-    fn images_of(&self, bound: Bound<'_>, n: u32) -> Result<Vec<f32>> {
+    fn images_of(&self, members: &MemberBuffers, n: u32) -> Result<Vec<f32>> {
         let mut images = Vec::with_capacity(self.targets.n_images * self.targets.n_pixels());
         for part in &self.joint.parts {
             let mut recording = Recording::new(&self.gpu, "images of a deformable")?;
-            let mut pass = pass(&mut recording, &self.kernels, &self.joint, bound, n);
+            let mut pass = pass(&mut recording, &self.kernels, &self.joint, members, n);
             pass.gaussians.targets = &part.buffers;
             record_images(&mut pass, part.phases.clone())?;
             self.gpu.wait(recording.finish()?.submit()?)?;
@@ -445,7 +505,7 @@ impl DeformableTrainer {
         let (n, deformable) = (self.n as usize, self.joint.deformable);
         let grid: Vec<[f32; 4]> =
             self.gpu.download(&self.joint.grid.motion_grid, 0, self.targets.n_phases * deformable.nodes())?;
-        let own: Vec<[f32; 4]> = self.gpu.download(&self.own.own_motion, 0, n * deformable.n_basis as usize)?;
+        let own: Vec<[f32; 4]> = self.gpu.download(&self.members.own.own_motion, 0, n * deformable.n_basis as usize)?;
         if let Some(bad) = grid.iter().chain(&own).flatten().find(|v| !v.is_finite()) {
             let step = u64::from(self.step);
             let (quantity, value) = ("the motion of the deformable set", f64::from(*bad));
@@ -460,14 +520,16 @@ impl DeformableTrainer {
             units: self.targets.units,
             n_phases: self.targets.n_phases,
             setup: self.joint.setup,
-            rows: self.gpu.download(&self.particles.gaussians, 0, n)?,
+            rows: self.gpu.download(&self.members.particles.gaussians, 0, n)?,
             step: self.step,
             is_crowd: false,
             agreement: None,
             intensities: None,
         };
         rest.check()?;
-        Ok(DeformableGaussians { rest, setup: deformable, grid, own })
+        let read = |buffers: &FillingBuffers| self.gpu.download(&buffers.filling, 0, n * self.targets.n_phases);
+        let filling = self.members.filling.as_ref().map(read).transpose()?;
+        Ok(DeformableGaussians { rest, setup: deformable, grid, own, filling })
     }
 
     /// Runs one iteration with a timestamp around each pass.
@@ -476,9 +538,9 @@ impl DeformableTrainer {
     /// Device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         let mut recording = Recording::timed(&self.gpu, "profiled iteration of a deformable", MAX_PASSES)?;
-        let bound = (&self.particles, &self.own);
-        let scratch = self.joint.scratch(&self.gpu, bound, self.n)?;
-        self.joint.record_step(&mut pass(&mut recording, &self.kernels, &self.joint, bound, self.n), &scratch)?;
+        let scratch = self.joint.scratch(&self.gpu, &self.members, self.n)?;
+        self.joint
+            .record_step(&mut pass(&mut recording, &self.kernels, &self.joint, &self.members, self.n), &scratch)?;
         self.step += 1;
         pass_times(&self.gpu, recording)
     }
@@ -489,37 +551,26 @@ impl DeformableTrainer {
     /// Device errors.
     pub fn work(&self) -> Result<GaussianWork> {
         let setup = &self.joint.setup;
-        let splats = (&self.particles.splats, &self.particles.image_of_splat);
+        let splats = (&self.members.particles.splats, &self.members.particles.image_of_splat);
         GaussianWork::of(&self.gpu, setup, splats, self.n * setup.n_views * setup.n_phases, SplatCost::AFFINE)
     }
-}
-
-/// Gaussians and their own motion on the device.
-type Bound<'a> = (&'a ParticleBuffers, &'a OwnMotionBuffers);
-
-fn upload(
-    gpu: &Gpu,
-    setup: &GaussianSetup,
-    particles: &Particles,
-    own: &OwnMotion,
-) -> Result<(ParticleBuffers, OwnMotionBuffers)> {
-    let n_places = particles.rows.len() as u64 * u64::from(setup.n_phases);
-    Ok((particles.upload(gpu, setup.n_views * setup.n_phases)?, own.upload(gpu, n_places)?))
 }
 
 fn pass<'a>(
     recording: &'a mut Recording,
     kernels: &'a (GaussianKernels, DeformableKernels),
     fit: &'a Fit,
-    (particles, own): Bound<'a>,
+    members: &'a MemberBuffers,
     n: u32,
 ) -> DeformablePass<'a> {
     let (common, kernels) = kernels;
+    let MemberBuffers { particles, own, filling } = members;
     DeformablePass {
         gaussians: GaussianPass { recording, kernels: common, targets: &fit.targets, particles, setup: &fit.setup, n },
         kernels,
         grid: &fit.grid,
         own,
+        filling: filling.as_ref(),
         setup: &fit.deformable,
     }
 }
@@ -528,14 +579,14 @@ fn record(
     gpu: &Gpu,
     kernels: &(GaussianKernels, DeformableKernels),
     fit: &Fit,
-    bound: Bound<'_>,
+    members: &MemberBuffers,
     n: u32,
     per_submit: u32,
 ) -> Result<Iterations> {
-    let scratch = fit.scratch(gpu, bound, n)?;
+    let scratch = fit.scratch(gpu, members, n)?;
     Iterations::record(gpu, per_submit, |iterations| {
         let mut recording = Recording::new(gpu, &format!("{iterations} iterations of a deformable"))?;
-        let mut pass = pass(&mut recording, kernels, fit, bound, n);
+        let mut pass = pass(&mut recording, kernels, fit, members, n);
         for _ in 0..iterations {
             fit.record_step(&mut pass, &scratch)?;
         }

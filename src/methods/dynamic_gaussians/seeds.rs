@@ -98,13 +98,14 @@ pub fn additions(targets: &Targets, settings: &sections::Gaussians, seed: u32, i
 }
 
 /// New Gaussians of a deformable set, at places of its rest phase where, moved along by `carried` (place, phase), every view lacks line
-/// integral at half of the phases or more; phases may lie between two.
+/// integral at half of the phases or more at which contrast fills it, by `is_filled` (place, phase); phases may lie between two.
 pub fn deformable_additions(
     targets: &Targets,
     settings: &sections::Gaussians,
     seed: u32,
     images: &[f32],
     carried: impl Fn(DVec3, f64) -> DVec3,
+    is_filled: impl Fn(DVec3, usize) -> bool,
 ) -> Vec<Gaussian> {
     let missing = missing_images(targets, images);
     let count = (settings.grow_share * f64::from(settings.count)) as usize;
@@ -112,9 +113,10 @@ pub fn deformable_additions(
     let weight = |place: &PossibleVessel| {
         let at =
             |phase: usize| lacking(targets, &missing, phase, |after| carried(place.position, phase as f64 + after));
-        let mut all: Vec<f64> = (0..targets.n_phases).map(at).collect();
+        let filled = (0..targets.n_phases).filter(|phase| is_filled(place.position, *phase));
+        let mut all: Vec<f64> = filled.map(at).collect();
         all.sort_by(f64::total_cmp);
-        enough(settings, all[(all.len() - 1) / 2])
+        all.len().checked_sub(1).map_or(0.0, |last| enough(settings, all[last / 2]))
     };
     let weights: Vec<f64> = places.iter().map(weight).collect();
     let draw = Draw { targets, settings, seed, round: targets.n_phases as u32 };

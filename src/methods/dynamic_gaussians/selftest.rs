@@ -1,6 +1,6 @@
 //! One set of Gaussians that moves over the beat: an iteration of its fit, stage by stage.
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::gaussians::particles::Particles;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
@@ -10,6 +10,7 @@ use crate::kernels::layout::{DeformableSetup, GaussianSetup};
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::filling::{FILLING_RATE, MIN_FILLING};
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::methods::dynamic_gaussians::twin::{DeformableParams, loss_and_gradient, phases_shown, shown};
 use crate::reference::gaussians::{self as reference, N_PARAMS, Params};
@@ -17,7 +18,7 @@ use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::{
     LOSS, NUMBERS, REPORT, SPLAT, TwinSplat, compare_backward, compare_gradient, compare_splats, device_gradient, f32s,
 };
-use crate::selftest::problems::{deformable_case, deformable_set};
+use crate::selftest::problems::{deformable_case, deformable_set, fillings};
 use glam::DVec3;
 
 const PROJECT: &[&str] = &[push::DeformableProject::SHADER];
@@ -26,6 +27,8 @@ const GRID_GRADIENT: &[&str] = &[push::DeformableGridGradient::SHADER];
 const UPDATE: &[&str] = &[push::DeformableUpdate::SHADER];
 const GRID_UPDATE: &[&str] = &[push::DeformableGridUpdate::SHADER];
 const GUESS: &[&str] = &[push::DeformableGuess::SHADER];
+const FILL: &[&str] = &[push::DeformableFill::SHADER];
+const FILLING: &[&str] = &[push::DeformableFilling::SHADER];
 
 /// First steps of Adam, all of nearly the same length, which f32 displacements lose a little of.
 const FIRST_STEP: Tolerance = Tolerance::OfLargest(2e-3);
@@ -58,16 +61,9 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     upload(gpu, &trainer.grid().motion_grid, &p.grid)?;
     upload(gpu, &trainer.own_motion().own_motion, &p.own)?;
     let images = trainer.images()?;
-    let (n, n_views, n_phases) = (rows.len(), targets.n_views, targets.n_phases);
-    let shown_at = |splat: usize| {
-        let (phase_and_view, i) = (splat / n, splat % n);
-        let (phase, image) = (phase_and_view / n_views, targets.image_of[phase_and_view]?);
-        Some((phase, image, shown(&deformable, &p, i, phase, &targets.views[image], n_phases)))
-    };
-    let shown: Vec<Option<(usize, usize, Params)>> = (0..n_phases * n_views * n).map(shown_at).collect();
-    let project = |(image, moved): (usize, &Params)| reference::project(moved, &targets.views[image], &setup);
-    let seen: Vec<TwinSplat> =
-        shown.iter().map(|s| s.as_ref().map(|(_, image, moved)| (*image, project((*image, moved))))).collect();
+    let (n, n_phases) = (rows.len(), targets.n_phases);
+    let shown = shown_in_images(&targets, &deformable, &p);
+    let seen = seen_in_images(&targets, &setup, &shown);
     compare_splats(gpu, trainer.particles(), &setup, PROJECT, &seen, findings)?;
     findings.numbers(SPLAT, "images", &images, &drawn(&targets, &setup, &seen), NUMBERS);
     let loss = told(trainer.advance(1))?.first().copied().unwrap_or(f64::NAN);
@@ -91,7 +87,78 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     let (_, _, gradient) = loss_and_gradient(&targets, &setup, &deformable, &p);
     compare_motion(gpu, &trainer, &deformable, (&p, &gradient), findings)?;
     findings.add(REPORT, "loss", (loss / twin_loss - 1.0).abs(), LOSS);
-    compare_guess(gpu, &trainer, &p, n_phases, findings)
+    compare_guess(gpu, &trainer, &p, n_phases, findings)?;
+    compare_filling(gpu, findings)
+}
+
+/// Gaussian in an image: the phase, the image, and the Gaussian as it is there; none where a view lacks the phase.
+type Shown = Option<(usize, usize, Params)>;
+
+/// Gaussians in all images, `[phase][view][Gaussian]`.
+fn shown_in_images(targets: &Targets, deformable: &DeformableSetup, p: &DeformableParams) -> Vec<Shown> {
+    let (n, n_views, n_phases) = (p.rows.len(), targets.n_views, targets.n_phases);
+    let at = |splat: usize| {
+        let (phase_and_view, i) = (splat / n, splat % n);
+        let (phase, image) = (phase_and_view / n_views, targets.image_of[phase_and_view]?);
+        Some((phase, image, shown(deformable, p, i, phase, &targets.views[image], n_phases)))
+    };
+    (0..n_phases * n_views * n).map(at).collect()
+}
+
+/// Splats of Gaussians in all images.
+fn seen_in_images(targets: &Targets, setup: &GaussianSetup, shown: &[Shown]) -> Vec<TwinSplat> {
+    let project = |(image, moved): (usize, &Params)| reference::project(moved, &targets.views[image], setup);
+    shown.iter().map(|s| s.as_ref().map(|(_, image, moved)| (*image, project((*image, moved))))).collect()
+}
+
+/// Compares the stages that a set has besides where contrast comes or goes: filled splats, the gradient of the filling, and the first
+/// step along it.
+fn compare_filling(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
+    findings.begin("deformable", "31 Gaussians whose contrast comes and goes, 14 images of 33 x 27 pixels");
+    let (mut targets, rows, config) = deformable_case()?;
+    targets.contrast_comes_and_goes = true;
+    let mut trainer = DeformableTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
+    let (setup, deformable) = (*trainer.setup(), *trainer.deformable_setup());
+    let (n, n_phases) = (rows.len(), targets.n_phases);
+    let mut p = deformable_set(&rows, &deformable, n_phases);
+    p.filling = fillings(n, n_phases, targets.rest_phase);
+    upload(gpu, &trainer.grid().motion_grid, &p.grid)?;
+    upload(gpu, &trainer.own_motion().own_motion, &p.own)?;
+    let Some(buffers) = trainer.filling().cloned() else {
+        return Err(Error::Internal("a set whose contrast comes and goes has no filling".into()));
+    };
+    gpu.upload(&buffers.filling, 0, &f32s(&p.filling))?;
+    trainer.images()?;
+    let seen = seen_in_images(&targets, &setup, &shown_in_images(&targets, &deformable, &p));
+    compare_splats(gpu, trainer.particles(), &setup, FILL, &seen, findings)?;
+    told(trainer.advance(1))?;
+    // By the device's moments.
+    let moments: Vec<[f32; 4]> = gpu.download(&trainer.particles().splat_moments, 0, 2 * seen.len())?;
+    let mut slopes = vec![0.0; p.filling.len()];
+    for (splat, seen) in seen.iter().enumerate() {
+        let (phase, i) = (splat / n / targets.n_views, splat % n);
+        let Some((image, _)) = seen else { continue };
+        let shown = phases_shown(phase, &targets.views[*image], n_phases);
+        let filled: f64 = shown.iter().map(|(at, share)| share * p.filling[i * n_phases + at]).sum();
+        for (at, share) in shown {
+            slopes[i * n_phases + at] += share * f64::from(moments[2 * splat][0]) / filled;
+        }
+    }
+    let read = |buffer: &Buffer| gpu.download::<f32>(buffer, 0, slopes.len());
+    findings.numbers(FILLING, "gradient of the filling", &read(&buffers.filling_gradient)?, &slopes, NUMBERS);
+    // At the rest phase vessels are full by definition.
+    let rests = |i: &usize| i % n_phases == targets.rest_phase;
+    let first: Vec<f64> = (0..slopes.len()).map(|i| if rests(&i) { 0.0 } else { 0.1 * slopes[i] }).collect();
+    findings.numbers(FILLING, "first moments of the filling", &read(&buffers.filling_first)?, &first, NUMBERS);
+    let step = |i: usize| if rests(&i) { 0.0 } else { -f64::from(FILLING_RATE) * slopes[i].signum() };
+    let bounded = |i: usize| (p.filling[i] + step(i)).clamp(MIN_FILLING.into(), 1.0) - p.filling[i];
+    let steep: Vec<usize> = (0..slopes.len()).filter(|i| rests(i) || slopes[*i].abs() > STEEP).collect();
+    let now = read(&buffers.filling)?;
+    let moved: Vec<f64> = steep.iter().map(|i| f64::from(now[*i]) - p.filling[*i]).collect();
+    let want: Vec<f64> = steep.iter().map(|i| bounded(*i)).collect();
+    findings.numbers(FILLING, "first step of the filling", &f32s(&moved), &want, FIRST_STEP);
+    findings.require(FILLING, "fillings with a slope", steep.len() > slopes.len() / 4);
+    Ok(())
 }
 
 /// Images of splats as the twin sees them.

@@ -12,6 +12,7 @@ use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
 use crate::kernels::layout::DeformableSetup;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
+use crate::methods::dynamic_gaussians::filling::{FILLING_RATE, FillingBuffers, MIN_FILLING};
 use std::ops::Range;
 
 /// Pipelines of the deformable set, beside those of [`crate::gaussians::stages::GaussianKernels`].
@@ -28,6 +29,10 @@ pub struct DeformableKernels {
     pub grid_update: Stage<push::DeformableGridUpdate>,
     /// Initial guess of the grid for tracking.
     pub guess: Stage<push::DeformableGuess>,
+    /// Filling of splats, where contrast comes or goes.
+    pub fill: Stage<push::DeformableFill>,
+    /// Gradient of the filling, and the optimiser on it.
+    pub filling: Stage<push::DeformableFilling>,
 }
 
 impl DeformableKernels {
@@ -44,6 +49,8 @@ impl DeformableKernels {
             grid_gradient: plain.stage(gpu)?,
             grid_update: plain.stage(gpu)?,
             guess: plain.stage(gpu)?,
+            fill: plain.stage(gpu)?,
+            filling: plain.stage(gpu)?,
         })
     }
 }
@@ -181,13 +188,16 @@ pub struct DeformablePass<'a> {
     pub grid: &'a GridBuffers,
     /// Own motion.
     pub own: &'a OwnMotionBuffers,
+    /// Filling; none where vessels are full all the time.
+    pub filling: Option<&'a FillingBuffers>,
     /// Constants on the host.
     pub setup: &'a DeformableSetup,
 }
 
 impl DeformablePass<'_> {
     fn run<P: PushConstants>(&mut self, stage: &Stage<P>, groups: Groups<'_>, push: P) -> Result<()> {
-        let more: [&dyn BufferSet; 2] = [self.grid, self.own];
+        let mut more: Vec<&dyn BufferSet> = vec![self.grid, self.own];
+        more.extend(self.filling.map(|filling| filling as &dyn BufferSet));
         self.gaussians.run(stage, groups, &more, push)
     }
 
@@ -221,12 +231,13 @@ impl DeformablePass<'_> {
         self.run(grid_gradient, self.nodes(grid_gradient, groups), push)
     }
 
-    /// Records the projection of all Gaussians into every view at some phases.
+    /// Records the projection of all Gaussians into every view at some phases, and their filling.
     fn project(&mut self, phases: &Range<u32>) -> Result<()> {
         let (project, n_gaussians) = (&self.kernels.project, self.gaussians.n);
         let n_seen = phases.len() as u32 * self.gaussians.setup.n_views;
         let groups = Groups::Direct([n_gaussians.div_ceil(project.local_size()), n_seen, 1]);
-        self.run(project, groups, push::DeformableProject { n_gaussians, first_phase: phases.start })
+        self.run(project, groups, push::DeformableProject { n_gaussians, first_phase: phases.start })?;
+        self.fill(phases)
     }
 
     /// Records the optimiser and the end of an iteration over all phases.
@@ -234,7 +245,30 @@ impl DeformablePass<'_> {
         let (update, n_gaussians) = (&self.kernels.update, self.gaussians.n);
         self.run(update, update.groups_for(n_gaussians), push::DeformableUpdate { n_gaussians })?;
         self.grid_update(0..self.gaussians.setup.n_phases)?;
+        self.update_filling()?;
         self.gaussians.report()
+    }
+
+    /// Records the filling of the splats of some phases, where contrast comes or goes.
+    fn fill(&mut self, phases: &Range<u32>) -> Result<()> {
+        if self.filling.is_none() {
+            return Ok(());
+        }
+        let (fill, n_gaussians) = (&self.kernels.fill, self.gaussians.n);
+        let n_seen = phases.len() as u32 * self.gaussians.setup.n_views;
+        let groups = Groups::Direct([n_gaussians.div_ceil(fill.local_size()), n_seen, 1]);
+        self.run(fill, groups, push::DeformableFill { n_gaussians, first_phase: phases.start })
+    }
+
+    /// Records the update of the filling from the moments of all splats, where contrast comes or goes.
+    fn update_filling(&mut self) -> Result<()> {
+        if self.filling.is_none() {
+            return Ok(());
+        }
+        let (filling, n_gaussians) = (&self.kernels.filling, self.gaussians.n);
+        let (rest_phase, rate, min_filling) = (self.setup.rest_phase, FILLING_RATE, MIN_FILLING);
+        let push = push::DeformableFilling { n_gaussians, rest_phase, rate, min_filling };
+        self.run(filling, filling.groups_for(n_gaussians), push)
     }
 
     fn grid_update(&mut self, phases: Range<u32>) -> Result<()> {
@@ -318,6 +352,8 @@ pub struct Track {
     pub before_that: u32,
     /// Images of the phase, which are consecutive.
     pub images: Range<u32>,
+    /// Phases whose motion is known before, where contrast comes or goes.
+    pub known: Vec<usize>,
 }
 
 /// Records the initial guess of a phase's grid, extrapolated from the two preceding phases; the pass has the constants of

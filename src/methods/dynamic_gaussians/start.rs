@@ -3,13 +3,15 @@
 
 use crate::config::{Config, sections};
 use crate::error::{Error, Result};
-use crate::gaussians::field::Gaussians;
+use crate::gaussians::field::{Gaussians, mass};
 use crate::gaussians::particles::Particles;
 use crate::gpu::device::Gpu;
+use crate::kernels::layout::Gaussian;
 use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Fit};
 use crate::methods::dynamic_gaussians::per_phase::{GaussianTrainer, strong};
 use crate::methods::dynamic_gaussians::stages::Track;
 use crate::methods::dynamic_gaussians::targets::Targets;
+use std::ops::Range;
 
 /// A deformable set in preparation.
 pub struct DeformableStart {
@@ -70,7 +72,11 @@ impl DeformableStart {
                     under_way.trainer.forget_momentum()?;
                     return Ok(Some(under_way.trainer));
                 };
-                under_way.trainer.track(&under_way.fit, &track)?;
+                let of_phase = under_way.meanwhile.at(track.phase as usize).copied();
+                // Without an image, nothing is seen.
+                let of_phase: Vec<Gaussian> = of_phase.filter(|_| !track.images.is_empty()).collect();
+                let of_phase = under_way.trainer.targets().contrast_comes_and_goes.then_some(&of_phase[..]);
+                under_way.trainer.track(&under_way.fit, &track, of_phase)?;
                 self.stage = Stage::Tracking(under_way);
             }
             Stage::Over => {
@@ -93,7 +99,10 @@ impl DeformableStart {
             found.rows.iter().zip(strong).map(|(g, strong)| strong && g.phase == rest_phase).collect();
         found.retain(&keep);
         let trainer = DeformableTrainer::with(&self.gpu, first.into_targets(), &self.config, &found)?;
-        let (fit, mut left) = (trainer.tracking()?, tracks(trainer.targets()));
+        let targets = trainer.targets();
+        let left =
+            if targets.contrast_comes_and_goes { tracks_by_contrast(targets, &meanwhile) } else { tracks(targets) };
+        let (fit, mut left) = (trainer.tracking()?, left);
         left.reverse();
         Ok(Tracking { trainer, fit, left, meanwhile })
     }
@@ -150,15 +159,39 @@ fn tracks(targets: &Targets) -> Vec<Track> {
     // Counted from the phase of rest.
     let forward = (1..=n / 2).map(|t| [t, t - 1, t.saturating_sub(2)]);
     let backward = (n / 2 + 1..n).rev().map(|t| [t, (t + 1) % n, if t + 2 < n { t + 2 } else { 0 }]);
-    let images = |phase: u32| {
-        let images: Vec<u32> = targets.views_at(phase as usize).map(|(image, _)| image as u32).collect();
-        images.first().map_or(0..0, |first| *first..first + images.len() as u32)
-    };
     let track = |since_rest: [u32; 3]| {
         let [phase, before, before_that] = since_rest.map(|t| (rest_phase + t) % n);
-        Track { phase, before, before_that, images: images(phase) }
+        Track { phase, before, before_that, images: images_of(targets, phase), known: Vec::new() }
     };
     forward.chain(backward).map(track).collect()
+}
+
+/// Images of a phase, which are consecutive.
+fn images_of(targets: &Targets, phase: u32) -> Range<u32> {
+    let images: Vec<u32> = targets.views_at(phase as usize).map(|(image, _)| image as u32).collect();
+    images.first().map_or(0..0, |first| *first..first + images.len() as u32)
+}
+
+/// Returns the order in which phases are tracked where contrast comes or goes, each from the two before it: from the phase of rest on,
+/// always the neighbour of a tracked phase whose own set, one of `sets`, has the largest mass.
+fn tracks_by_contrast(targets: &Targets, sets: &Gaussians) -> Vec<Track> {
+    let n = targets.n_phases;
+    let shown: Vec<f64> = (0..n).map(|phase| sets.at(phase).map(|g| mass(g, &sets.setup)).sum()).collect();
+    let mut known = vec![targets.rest_phase];
+    let mut tracks = Vec::new();
+    while known.len() < n {
+        // Each open neighbour of a tracked phase, with the step towards it.
+        let steps = known.iter().flat_map(|before| [(*before, 1), (*before, n - 1)]);
+        let open =
+            steps.map(|(before, step)| ((before + step) % n, before, step)).filter(|(to, ..)| !known.contains(to));
+        let Some((phase, before, step)) = open.max_by(|a, b| shown[a.0].total_cmp(&shown[b.0])) else { break };
+        let two_before = (before + n - step) % n;
+        let before_that = if known.contains(&two_before) { two_before } else { before };
+        let [at, before, before_that] = [phase, before, before_that].map(|phase| phase as u32);
+        tracks.push(Track { phase: at, before, before_that, images: images_of(targets, at), known: known.clone() });
+        known.push(phase);
+    }
+    tracks
 }
 
 impl DeformableTrainer {

@@ -69,6 +69,8 @@ pub struct Targets {
     pub lengths: Lengths,
     /// Phase at which the Gaussians of a deformable set rest.
     pub rest_phase: usize,
+    /// True where some phase shows so much less than others that contrast must have come or gone meanwhile.
+    pub contrast_comes_and_goes: bool,
     /// Cells of the hull, per phase.
     pub places: Vec<Vec<PossibleVessel>>,
     /// Side of a cell, pixels at the isocentre.
@@ -145,6 +147,7 @@ impl Targets {
             contrast: Vec::new(),
             lengths: Lengths { factor: 1.0, smoothing: 1.0 },
             rest_phase: 0,
+            contrast_comes_and_goes: false,
             places: Vec::new(),
             cell: motion.hull.cell / units.pixel,
         };
@@ -182,6 +185,7 @@ impl Targets {
         let noise = motion.views.iter().flat_map(|v| v.background.noise.values.iter().map(|s| share(*s)));
         targets.noise = SharedImages::new(noise.collect(), slots, dataset.n_pixels());
         targets.rest_phase = targets.phase_that_shows_most();
+        targets.contrast_comes_and_goes = targets.some_phase_lacks_contrast();
         let own = |view: usize, change: &Image| {
             let [width, height] = dataset.views[view].size;
             Image { width, height, values: dataset.own(view, &change.values).into_owned() }
@@ -201,15 +205,12 @@ impl Targets {
     }
 
     /// Returns the form of the dynamic field that suits the data where `asked` leaves it open. A deformable set shares one set of
-    /// Gaussians over the beat; it needs enough phases to be followed from one to the next, a rest phase that two views show,
-    /// and vessels that are filled all the time.
+    /// Gaussians over the beat; it needs enough phases to be followed from one to the next, and a rest phase that two views show.
     pub fn form(&self, asked: GaussianForm) -> GaussianForm {
         const MIN_PHASES: usize = 4;
         let rests = self.views_at(self.rest_phase).count() >= MIN_VIEWS;
         match asked {
-            GaussianForm::Auto if self.n_phases >= MIN_PHASES && rests && !self.contrast_comes_and_goes() => {
-                GaussianForm::Deformable
-            }
+            GaussianForm::Auto if self.n_phases >= MIN_PHASES && rests => GaussianForm::Deformable,
             GaussianForm::Auto => GaussianForm::Phase,
             asked => asked,
         }
@@ -226,7 +227,7 @@ impl Targets {
 
     /// Tells whether some phase shows so much less than others that contrast must have come or gone meanwhile. Each view is
     /// compared with itself: not every view has every phase, and some see more of the vessels than others.
-    pub fn contrast_comes_and_goes(&self) -> bool {
+    fn some_phase_lacks_contrast(&self) -> bool {
         let shown = |phase: usize, view: usize| Some(self.shown_in(self.image_of[phase * self.n_views + view]?));
         let max_in = |view: usize| (0..self.n_phases).filter_map(|phase| shown(phase, view)).fold(0.0, f64::max);
         let max: Vec<f64> = (0..self.n_views).map(max_in).collect();

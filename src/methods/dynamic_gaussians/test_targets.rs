@@ -45,6 +45,7 @@ pub fn targets(images: &[f32], n_views: usize) -> Targets {
         low,
         lengths: Lengths { factor: 1.0, smoothing: 1.0 },
         rest_phase: 0,
+        contrast_comes_and_goes: false,
         places: vec![Vec::new(); PHASES],
         cell: 1.0,
     }

@@ -129,7 +129,7 @@ impl GaussiansFit {
 
     /// Gives the static field the line integrals of the images less those of the Gaussians.
     fn set_remaining_images(&mut self) -> Result<()> {
-        let pictures = Pictures::new(&self.gpu, &self.field())?;
+        let pictures = Pictures::as_imaged(&self.gpu, &self.field())?;
         let data = self.fields.data();
         let (width, pixels) = (data.setup.image_width as usize, data.setup.n_pixels as usize);
         let (images, shots) = (data.images.clone(), &self.shots);

@@ -18,6 +18,8 @@ pub struct DeformableParams {
     pub own: Vec<DVec3>,
     /// Displacements of the grid's nodes, `[phase][node]`; those of the phase of rest stay fixed.
     pub grid: Vec<DVec3>,
+    /// Filling, `[Gaussian][phase]`, constant at the rest phase; empty where vessels are full all the time.
+    pub filling: Vec<f64>,
 }
 
 impl DeformableParams {
@@ -27,9 +29,13 @@ impl DeformableParams {
             rows: vec![[0.0; N_PARAMS]; self.rows.len()],
             own: vec![DVec3::ZERO; self.own.len()],
             grid: vec![DVec3::ZERO; self.grid.len()],
+            filling: vec![0.0; self.filling.len()],
         }
     }
 }
+
+/// Place of the log-density in [`Params`].
+const LOG_DENSITY: usize = 3;
 
 /// Nodes and basis functions that determine a Gaussian's position at a phase.
 struct Motion {
@@ -58,6 +64,14 @@ pub fn phases_shown(phase: usize, view: &SplatView, n_phases: usize) -> [(usize,
     BeatTime { phase: phase as u32, after_phase: view.after_phase }.shown(n_phases as u32)
 }
 
+/// Returns the filling of a Gaussian in an image of a phase: linearly interpolated between two phases.
+fn filling_shown(p: &DeformableParams, i: usize, phase: usize, view: &SplatView, n_phases: usize) -> f64 {
+    if p.filling.is_empty() {
+        return 1.0;
+    }
+    phases_shown(phase, view, n_phases).iter().map(|(at, share)| share * p.filling[i * n_phases + at]).sum()
+}
+
 /// Returns a Gaussian as in an image of a phase: linearly interpolated between two phases.
 pub fn shown(
     deformable: &DeformableSetup,
@@ -71,6 +85,7 @@ pub fn shown(
     let [(here, _), (beyond, share)] = phases_shown(phase, view, n_phases);
     let (mut out, there) = (at(here), at(beyond));
     (0..3).for_each(|k| out[k] += share * (there[k] - out[k]));
+    out[LOG_DENSITY] += filling_shown(p, i, phase, view, n_phases).ln();
     out
 }
 
@@ -112,7 +127,11 @@ pub fn loss_and_gradient(
             let g = gaussians::gradient(&moved, view, setup, seen.moments(setup, &residuals[image]));
             gradient.rows[i].iter_mut().zip(g).for_each(|(sum, g)| *sum += g);
             let x = DVec3::new(g[0], g[1], g[2]);
+            let filled = filling_shown(p, i, phase, view, targets.n_phases);
             for (phase, share) in phases_shown(phase, view, targets.n_phases) {
+                if !p.filling.is_empty() {
+                    gradient.filling[i * targets.n_phases + phase] += share * g[LOG_DENSITY] / filled;
+                }
                 add_place(&mut gradient, i, phase == deformable.rest_phase as usize, &place(phase, i), share * x);
             }
         }

@@ -1,0 +1,128 @@
+//! Motion of the vessels that contrast does not show at a phase. Where contrast shows a part of the vessels, the motion of this part
+//! determines a mixture of the motion at other phases; where it shows nothing, the motion follows a smooth curve through the other phases.
+
+use crate::calibrate::linear::Symmetric;
+use crate::gaussians::field::{DeformableGaussians, mass, shares, vector};
+use glam::DVec3;
+
+/// Share of the vessels' mass from which on a phase is seen well.
+const WELL_SEEN: f64 = 0.9;
+/// Weight of squared velocities against squared accelerations of a smooth curve, in phases.
+const VELOCITY: f64 = 0.3;
+/// Penalty on squared changes of the weights of a mixture, as a share of the mean squared displacement.
+const RIDGE: f64 = 0.01;
+
+/// Tells whether contrast shows most of the vessels at a phase.
+pub(super) fn is_well_seen(field: &DeformableGaussians, phase: usize) -> bool {
+    field.filled_share(phase) >= WELL_SEEN
+}
+
+/// Replaces the displacements of the grid where Gaussians are not filled, at all phases that are not seen well, beginning with those that
+/// are seen best.
+pub(super) fn complete(field: &mut DeformableGaussians) {
+    let n_phases = field.rest.n_phases;
+    let share: Vec<f64> = (0..n_phases).map(|phase| field.filled_share(phase)).collect();
+    let rest_phase = field.setup.rest_phase as usize;
+    let (mut known, mut open): (Vec<usize>, Vec<usize>) =
+        (0..n_phases).partition(|phase| *phase == rest_phase || share[*phase] >= WELL_SEEN);
+    open.sort_by(|a, b| share[*b].total_cmp(&share[*a]));
+    for phase in open {
+        complete_phase(field, phase, &known);
+        known.push(phase);
+    }
+}
+
+/// Replaces the displacements of the grid at a phase where Gaussians are not filled, by those of the mixture of `known` phases that moves
+/// filled Gaussians as they move.
+pub(super) fn complete_phase(field: &mut DeformableGaussians, phase: usize, known: &[usize]) {
+    let mut weights = smooth_weights(field.rest.n_phases, known, phase);
+    let places = |at: usize| (0..field.rest.rows.len()).map(|i| field.position(i, at as f64)).collect::<Vec<_>>();
+    let (of_known, here) = (known.iter().map(|at| places(*at)).collect::<Vec<_>>(), places(phase));
+    let mass: Vec<f64> = field.rest.rows.iter().map(|g| mass(g, &field.rest.setup)).collect();
+    // Squares: places of Gaussians with hardly any contrast are arbitrary, however many they are.
+    let certain: Vec<f64> = (0..mass.len()).map(|i| field.filling_at(i, phase).powi(2) * mass[i]).collect();
+    let correction = mixture(&of_known, &here, &weights, (&certain, &mass));
+    weights.iter_mut().zip(correction).for_each(|(weight, more)| *weight += more);
+    let seen = seen_nodes(field, phase);
+    let nodes = field.setup.nodes();
+    for (node, seen) in seen.into_iter().enumerate() {
+        let mixed: DVec3 =
+            known.iter().zip(&weights).map(|(at, weight)| *weight * vector(&field.grid[at * nodes + node])).sum();
+        let was = vector(&field.grid[phase * nodes + node]);
+        let [x, y, z] = mixed.lerp(was, seen).as_vec3().to_array();
+        field.grid[phase * nodes + node] = [x, y, z, 0.0];
+    }
+}
+
+/// Returns for each node of the grid the share of the mass around it that is filled at a phase; 0 where no Gaussian is.
+fn seen_nodes(field: &DeformableGaussians, phase: usize) -> Vec<f64> {
+    let mut sums = vec![[0.0; 2]; field.setup.nodes()];
+    for (i, g) in field.rest.rows.iter().enumerate() {
+        let (mass, filling) = (mass(g, &field.rest.setup), field.filling_at(i, phase));
+        for (node, share) in shares(&field.setup, DVec3::from_array(g.position.map(f64::from))) {
+            sums[node][0] += filling * share * mass;
+            sums[node][1] += share * mass;
+        }
+    }
+    sums.into_iter().map(|[filled, all]| if all > 0.0 { filled / all } else { 0.0 }).collect()
+}
+
+/// Returns the weights of `known` phases in the value at a phase of the smoothest periodic curve through them; their sum is 1.
+fn smooth_weights(n_phases: usize, known: &[usize], phase: usize) -> Vec<f64> {
+    let open: Vec<usize> = (0..n_phases).filter(|at| !known.contains(at)).collect();
+    let stiffness = stiffness(n_phases);
+    let mut matrix = Symmetric::zeros(open.len());
+    for (i, a) in open.iter().enumerate() {
+        (0..=i).for_each(|j| matrix.add(i, j, stiffness(*a, open[j])));
+    }
+    let place = open.iter().position(|at| *at == phase).unwrap_or(0);
+    let unit: Vec<f64> = (0..open.len()).map(|i| f64::from(u8::from(i == place))).collect();
+    let equal = 1.0 / known.len().max(1) as f64;
+    match matrix.solve(&unit) {
+        // The matrix is symmetric: a row of its inverse is a column of it.
+        Some(row) => {
+            known.iter().map(|at| -open.iter().zip(&row).map(|(a, r)| r * stiffness(*a, *at)).sum::<f64>()).collect()
+        }
+        None => vec![equal; known.len()],
+    }
+}
+
+/// Returns the sum of squared accelerations and velocities of a periodic curve, as a quadratic form of its values at two phases.
+fn stiffness(n_phases: usize) -> impl Fn(usize, usize) -> f64 {
+    let is = |at: usize, phase: usize| f64::from(u8::from(at % n_phases == phase));
+    let form = |a: usize, b: usize| -> f64 {
+        let at = |t: usize| {
+            let acceleration = |p: usize| is(t + n_phases - 1, p) - 2.0 * is(t, p) + is(t + 1, p);
+            let velocity = |p: usize| is(t + 1, p) - is(t, p);
+            acceleration(a) * acceleration(b) + VELOCITY * velocity(a) * velocity(b)
+        };
+        (0..n_phases).map(at).sum()
+    };
+    let all: Vec<f64> = (0..n_phases * n_phases).map(|i| form(i / n_phases, i % n_phases)).collect();
+    move |a, b| all[a * n_phases + b]
+}
+
+/// Returns changes of the `weights` of known phases, with sum 0, after which the mixture of their positions, `[known][Gaussian]`, is close
+/// to those at the phase, `here`. `certain` is the weight of each Gaussian, `most` its weight where it is filled: the fewer are filled,
+/// the smaller the changes.
+fn mixture(of_known: &[Vec<DVec3>], here: &[DVec3], weights: &[f64], (certain, most): (&[f64], &[f64])) -> Vec<f64> {
+    let n = of_known.len();
+    let mut matrix = Symmetric::zeros(n);
+    let mut right = vec![0.0; n];
+    let mut trace = 0.0;
+    for (i, (certain, most)) in certain.iter().zip(most).enumerate() {
+        let mean = of_known.iter().map(|places| places[i]).sum::<DVec3>() / n.max(1) as f64;
+        let ways: Vec<DVec3> = of_known.iter().map(|places| places[i] - mean).collect();
+        let mixed: DVec3 = ways.iter().zip(weights).map(|(way, weight)| *weight * *way).sum();
+        let left = here[i] - mean - mixed;
+        for a in 0..n {
+            (0..=a).for_each(|b| matrix.add(a, b, certain * ways[a].dot(ways[b])));
+            right[a] += certain * ways[a].dot(left);
+            trace += most * ways[a].length_squared();
+        }
+    }
+    (0..n).for_each(|a| matrix.add(a, a, RIDGE * trace / n as f64));
+    let change = matrix.solve(&right).unwrap_or_else(|| vec![0.0; n]);
+    let mean = change.iter().sum::<f64>() / n.max(1) as f64;
+    change.into_iter().map(|c| c - mean).collect()
+}
