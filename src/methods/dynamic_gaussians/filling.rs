@@ -106,3 +106,34 @@ pub fn from_set_of_phase(moved: &[Gaussian], of_phase: &[Gaussian], setup: &Gaus
     };
     moved.iter().map(filling).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(x: f32, density: f32) -> Gaussian {
+        Gaussian { position: [x, 0.0, 0.0], log_density: density.ln(), ..Gaussian::default() }
+    }
+
+    #[test]
+    fn filling_is_the_share_that_the_set_of_the_phase_shows() {
+        let setup = GaussianSetup { min_scale: 0.4, max_scale: 6.0, ..GaussianSetup::default() };
+        let vessel: Vec<Gaussian> = (0..40).map(|i| row(i as f32, 0.5)).collect();
+        // The other set has half as many Gaussians, of other places; it shows all up to 20, half of the rest up to 30.
+        let shown: Vec<Gaussian> = (0..15).map(|i| row(2.0 * i as f32 + 0.7, if i < 10 { 1.0 } else { 0.5 })).collect();
+        let filling = from_set_of_phase(&vessel, &shown, &setup, 1.5);
+        for (at, expected) in [(5, 1.0), (12, 1.0), (25, 0.5), (36, MIN_FILLING), (39, MIN_FILLING)] {
+            assert!((filling[at] - expected).abs() < 0.06, "{at}: {} instead of {expected}", filling[at]);
+        }
+    }
+
+    #[test]
+    fn fillings_stay_with_their_gaussians() {
+        let mut filling = Filling::fresh(vec![0.1, 0.2, 0.3, 0.4, 0.5, 0.6]);
+        filling.first = vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
+        filling.retain(&[true, false, true]);
+        filling.append(vec![0.7, 0.8]);
+        assert_eq!(filling.values, [0.1, 0.2, 0.5, 0.6, 0.7, 0.8]);
+        assert_eq!(filling.first, [1.0, 2.0, 5.0, 6.0, 0.0, 0.0]);
+    }
+}

@@ -195,6 +195,11 @@ impl Fit for GaussiansFit {
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        if self.gaussians.is_some() {
+            // The static field has no images before the Gaussians are fitted; its passes take as long with those that the run has.
+            let images = self.fields.data().images.clone();
+            self.fields.set_images(|frame| Ok(images[frame].clone()))?;
+        }
         self.fields.profile_step()
     }
 

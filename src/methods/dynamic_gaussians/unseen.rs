@@ -126,3 +126,85 @@ fn mixture(of_known: &[Vec<DVec3>], here: &[DVec3], weights: &[f64], (certain, m
     let mean = change.iter().sum::<f64>() / n.max(1) as f64;
     change.into_iter().map(|c| c - mean).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gaussians::field::{Gaussians, Units, inverse_step};
+    use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
+
+    const PHASES: usize = 10;
+
+    /// Displacement of a point at a phase: three modes over the beat, each linear in the position.
+    fn displacement(x: DVec3, phase: usize) -> DVec3 {
+        let angle = std::f64::consts::TAU * phase as f64 / PHASES as f64;
+        let (swing, turn) = (1.0 - angle.cos(), (2.0 * angle).sin());
+        swing * (DVec3::new(2.0, -1.0, 3.0) + 0.1 * DVec3::new(x.z, x.x, x.y))
+            + turn * 0.05 * DVec3::new(x.y, -x.x, 0.0)
+    }
+
+    /// A vessel along x, filled at each phase up to the share of its length that `filled_to` states.
+    fn vessel(filled_to: [f64; PHASES]) -> DeformableGaussians {
+        let (n_nodes, half_side) = (5, 40.0);
+        let setup = DeformableSetup {
+            n_nodes,
+            half_side,
+            inverse_step: inverse_step(n_nodes, half_side),
+            ..DeformableSetup::default()
+        };
+        let node = |i: usize| DVec3::new((i % 5) as f64, (i / 5 % 5) as f64, (i / 25) as f64) * 20.0 - 40.0;
+        let n = 61;
+        let row = |i: usize| Gaussian { position: [i as f32 - 30.0, 0.2 * i as f32 - 8.0, 5.0], ..Gaussian::default() };
+        let filled = |i: usize, phase: usize| if (i as f64) < filled_to[phase] * n as f64 { 1.0 } else { 0.01 };
+        let pack = |v: DVec3| [v.x as f32, v.y as f32, v.z as f32, 0.0];
+        DeformableGaussians {
+            rest: Gaussians {
+                units: Units { pixel: 0.01, strongest: 0.5 },
+                n_phases: PHASES,
+                setup: GaussianSetup { min_scale: 0.1, max_scale: 9.0, ..GaussianSetup::default() },
+                rows: (0..n).map(row).collect(),
+                step: 9,
+                is_crowd: false,
+                agreement: None,
+                intensities: None,
+            },
+            setup,
+            grid: (0..PHASES).flat_map(|t| (0..125).map(move |i| pack(displacement(node(i), t)))).collect(),
+            own: Vec::new(),
+            filling: Some((0..n * PHASES).map(|i| filled(i / PHASES, i % PHASES)).collect()),
+        }
+    }
+
+    /// Largest distance of a Gaussian at a phase from where it is in truth.
+    fn error(field: &DeformableGaussians, truth: &DeformableGaussians, phase: usize) -> f64 {
+        let of = |i: usize| field.position(i, phase as f64).distance(truth.position(i, phase as f64));
+        (0..truth.rest.rows.len()).map(of).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn a_phase_without_contrast_moves_as_between_its_neighbours() {
+        let truth = vessel([1.0, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0]);
+        let mut field = truth.clone();
+        let nodes = field.setup.nodes();
+        field.grid[4 * nodes..5 * nodes].fill([0.0; 4]);
+        let before = error(&field, &truth, 4);
+        complete(&mut field);
+        let after = error(&field, &truth, 4);
+        assert!(before > 4.0 && after < 0.4 * before, "{after} pixels, before {before}");
+        for phase in (0..PHASES).filter(|phase| *phase != 4) {
+            assert_eq!(error(&field, &truth, phase), 0.0, "phase {phase} is seen");
+        }
+    }
+
+    #[test]
+    fn weights_of_smooth_curves_add_up_to_one() {
+        for (n_phases, known) in [(10, vec![3, 4, 5, 6, 7]), (10, vec![2]), (4, vec![0, 1, 3]), (2, vec![1])] {
+            let phase = (0..n_phases).find(|phase| !known.contains(phase)).unwrap();
+            let weights = smooth_weights(n_phases, &known, phase);
+            assert!((weights.iter().sum::<f64>() - 1.0).abs() < 1e-9, "{known:?}: {weights:?}");
+        }
+        // Values on both sides count equally.
+        let weights = smooth_weights(10, &[0, 1, 2, 3, 5, 6, 7, 8, 9], 4);
+        assert!((weights[3] - weights[4]).abs() < 1e-12 && weights[3] > 0.5, "{weights:?}");
+    }
+}
