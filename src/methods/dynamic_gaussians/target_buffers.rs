@@ -273,7 +273,7 @@ mod tests {
     fn phases_are_divided_into_runs_of_few_images() {
         let mut targets = targets(&vec![0.0; PHASES * 3 * SIDE * SIDE], 3);
         let images = |targets: &Targets, most| runs(targets, most).into_iter().map(|run| run.1).collect::<Vec<_>>();
-        assert_eq!(images(&targets, 30), [0..30]);
+        assert_eq!(images(&targets, 30), vec![Range { start: 0, end: 30 }]);
         assert_eq!(images(&targets, 13), [0..12, 12..24, 24..30]);
         assert_eq!(runs(&targets, 13)[1].0, 4..8);
         assert_eq!(images(&targets, 2).len(), PHASES, "a phase is not divided");
