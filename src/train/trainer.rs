@@ -76,7 +76,7 @@ impl Trainer {
     /// [`Error::Config`] when `tuning` asks for what the device lacks; device errors, [`Error::OutOfMemory`] first of
     /// all.
     pub fn new(gpu: &Gpu, plan: Plan, dataset: &Dataset, tuning: Tuning) -> Result<Trainer> {
-        Self::start(gpu, plan, dataset, tuning, Beginning::Scratch)
+        Self::after_adjustment(gpu, plan, dataset, tuning, None)
     }
 
     /// Starts a run from scratch, with a fit of Gaussians that was made while its views were adjusted.

@@ -111,7 +111,7 @@ impl Adjuster<'_> {
         let outcome = |poses: Poses, accepted: bool, after: Option<f64>, made: MadeGaussians| {
             let record = Adjustment { accepted, misfit_before: before, misfit_after: after };
             let adjusted = Adjusted { views: self.stands.views.clone(), poses, record };
-            Ok(Some(AdjustedFit { adjusted, made: Some(made) }))
+            Ok(Some(AdjustedFit { adjusted, made: self.is_full_size.then_some(made) }))
         };
         if before <= SMALL_MISFIT || before >= LARGE_MISFIT {
             return outcome(start, false, None, made);

@@ -3,6 +3,7 @@
 
 use crate::gaussians::field::DeformableGaussians;
 use crate::geometry::MM_PER_UNIT;
+use crate::methods::dynamic_gaussians::linked::{extent, groups, grown};
 use glam::DVec3;
 
 /// Motion, as a share of that of the median Gaussian, below which a Gaussian is slow.
@@ -43,7 +44,7 @@ impl Catheter {
             let slowest = part.iter().map(|i| points.motion[*i]).fold(f64::INFINITY, f64::min);
             part.len() >= MIN_COUNT && slowest < SLOWEST && points.extent(part) >= MIN_EXTENT * factor
         };
-        let parts = points.parts(slow, LINK * factor);
+        let parts = groups(slow, points.near(LINK * factor));
         let part = parts.into_iter().filter(is_catheter).max_by_key(Vec::len)?;
         let slowest = part.iter().map(|i| points.motion[*i]).fold(f64::INFINITY, f64::min);
         let part = points.with_neighbours(part, NEXT * factor);
@@ -83,40 +84,20 @@ impl Points {
         Points { places, motion }
     }
 
-    /// Length of the diagonal of a box around points.
     fn extent(&self, part: &[usize]) -> f64 {
-        let places = part.iter().map(|i| self.places[*i]);
-        let [low, high] = places.fold([DVec3::MAX, DVec3::MIN], |[low, high], x| [low.min(x), high.max(x)]);
-        (high - low).max(DVec3::ZERO).length()
+        extent(part.iter().map(|i| self.places[*i]))
     }
 
-    /// Returns groups of points whose neighbours are less than `link` apart.
-    fn parts(&self, mut left: Vec<usize>, link: f64) -> Vec<Vec<usize>> {
-        let mut parts = Vec::new();
-        while let Some(first) = left.pop() {
-            let mut part = vec![first];
-            let mut looked_at = 0;
-            while looked_at < part.len() {
-                let from = self.places[part[looked_at]];
-                part.extend(left.extract_if(.., |other| self.places[*other].distance(from) < link));
-                looked_at += 1;
-            }
-            parts.push(part);
-        }
-        parts
+    /// Tells whether two points are less than `link` apart.
+    fn near(&self, link: f64) -> impl Fn(usize, usize) -> bool {
+        move |a, b| self.places[a].distance(self.places[b]) < link
     }
 
     /// Adds the neighbours of a part that move up to [`UP_TO`], and theirs.
-    fn with_neighbours(&self, mut part: Vec<usize>, next: f64) -> Vec<usize> {
+    fn with_neighbours(&self, part: Vec<usize>, next: f64) -> Vec<usize> {
         let mut left: Vec<usize> =
             (0..self.places.len()).filter(|i| self.motion[*i] < UP_TO && !part.contains(i)).collect();
-        let mut looked_at = 0;
-        while looked_at < part.len() {
-            let from = self.places[part[looked_at]];
-            part.extend(left.extract_if(.., |other| self.places[*other].distance(from) < next));
-            looked_at += 1;
-        }
-        part
+        grown(part, &mut left, self.near(next))
     }
 }
 

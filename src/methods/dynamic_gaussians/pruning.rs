@@ -3,6 +3,7 @@
 
 use crate::gaussians::field::scales;
 use crate::kernels::layout::{Gaussian, GaussianSetup};
+use crate::methods::dynamic_gaussians::linked::{extent, groups};
 use crate::methods::dynamic_gaussians::remainder::remainders;
 use crate::methods::dynamic_gaussians::targets::Targets;
 use glam::DVec3;
@@ -22,11 +23,7 @@ const FIT_DEVIATION: f64 = 0.02;
 
 /// Returns the short components of a set, as indices of its Gaussians.
 pub(super) fn short_components(rows: &[Gaussian], setup: &GaussianSetup, factor: f64) -> Vec<Vec<usize>> {
-    let short = |members: &Vec<usize>| {
-        let positions = members.iter().map(|i| position(&rows[*i]));
-        let [low, high] = positions.fold([DVec3::MAX, DVec3::MIN], |[low, high], x| [low.min(x), high.max(x)]);
-        (high - low).length() <= SHORT * factor
-    };
+    let short = |members: &Vec<usize>| extent(members.iter().map(|i| position(&rows[*i]))) <= SHORT * factor;
     components(rows, setup).into_iter().filter(short).collect()
 }
 
@@ -40,19 +37,7 @@ fn components(rows: &[Gaussian], setup: &GaussianSetup) -> Vec<Vec<usize>> {
     let near = |i: usize, j: usize| {
         position(&rows[i]).distance(position(&rows[j])) < LINK_SCALES * 0.5 * (longest[i] + longest[j])
     };
-    let mut left: Vec<usize> = (0..rows.len()).collect();
-    let mut found = Vec::new();
-    while let Some(first) = left.pop() {
-        let mut members = vec![first];
-        let mut looked_at = 0;
-        while looked_at < members.len() {
-            let from = members[looked_at];
-            members.extend(left.extract_if(.., |other| near(from, *other)));
-            looked_at += 1;
-        }
-        found.push(members);
-    }
-    found
+    groups((0..rows.len()).collect(), near)
 }
 
 /// Evidence of the images for components: what the whole field leaves of them.
