@@ -7,6 +7,8 @@ use glam::DVec3;
 
 /// Share of the vessels' mass from which on a phase is seen well.
 const WELL_SEEN: f64 = 0.9;
+/// Filling below which the place of a Gaussian is arbitrary.
+const LEAST_FILLING: f64 = 0.5;
 /// Weight of squared velocities against squared accelerations of a smooth curve, in phases.
 const VELOCITY: f64 = 0.3;
 /// Penalty on squared changes of the weights of a mixture, as a share of the mean squared displacement.
@@ -39,8 +41,7 @@ pub(super) fn complete_phase(field: &mut DeformableGaussians, phase: usize, know
     let places = |at: usize| (0..field.rest.rows.len()).map(|i| field.position(i, at as f64)).collect::<Vec<_>>();
     let (of_known, here) = (known.iter().map(|at| places(*at)).collect::<Vec<_>>(), places(phase));
     let mass: Vec<f64> = field.rest.rows.iter().map(|g| mass(g, &field.rest.setup)).collect();
-    // Squares: places of Gaussians with hardly any contrast are arbitrary, however many they are.
-    let certain: Vec<f64> = (0..mass.len()).map(|i| field.filling_at(i, phase).powi(2) * mass[i]).collect();
+    let certain: Vec<f64> = (0..mass.len()).map(|i| certainty(field.filling_at(i, phase)) * mass[i]).collect();
     let correction = mixture(&of_known, &here, &weights, (&certain, &mass));
     weights.iter_mut().zip(correction).for_each(|(weight, more)| *weight += more);
     let seen = seen_nodes(field, phase);
@@ -52,6 +53,13 @@ pub(super) fn complete_phase(field: &mut DeformableGaussians, phase: usize, know
         let [x, y, z] = mixed.lerp(was, seen).as_vec3().to_array();
         field.grid[phase * nodes + node] = [x, y, z, 0.0];
     }
+}
+
+/// Returns how certain the place of a Gaussian is at a phase, 0 to 1, as a function of its filling: with hardly any contrast, its place is
+/// arbitrary.
+fn certainty(filling: f64) -> f64 {
+    let least = LEAST_FILLING;
+    ((filling - least) / (1.0 - least)).clamp(0.0, 1.0)
 }
 
 /// Returns for each node of the grid the share of the mass around it that is filled at a phase; 0 where no Gaussian is.
@@ -190,7 +198,7 @@ mod tests {
         let before = error(&field, &truth, 4);
         complete(&mut field);
         let after = error(&field, &truth, 4);
-        assert!(before > 4.0 && after < 0.4 * before, "{after} pixels, before {before}");
+        assert!(before > 4.0 && after < 1.0, "{after} pixels, before {before}");
         for phase in (0..PHASES).filter(|phase| *phase != 4) {
             assert_eq!(error(&field, &truth, phase), 0.0, "phase {phase} is seen");
         }
