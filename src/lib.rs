@@ -32,7 +32,7 @@
 //! # let directory = tempfile::tempdir().unwrap();
 //! # let (data, out) = (directory.path().join("phantom"), directory.path());
 //! # let options = nertca_vk::phantom::dataset::PhantomOptions {
-//! #     setting: nertca_vk::phantom::dataset::Setting::Xcat,
+//! #     setting: nertca_vk::phantom::dataset::Setting::SmallXcat,
 //! #     size: 32,
 //! #     phases: 4,
 //! #     views: nertca_vk::phantom::views::ViewAngles::published(3)?,

@@ -1,5 +1,6 @@
 //! Phantom datasets: projects moving volumes, makes exact masks, applies degradations and writes the dataset.
 
+use crate::choice::Choice;
 use crate::error::{Error, Result};
 use crate::formats::volume::VolumeHints;
 use crate::geometry::{CArm, Geometry, ViewRays};
@@ -10,7 +11,7 @@ use crate::phantom::noise::add_noise;
 use crate::phantom::projector::Projector;
 use crate::phantom::runs::{Shot, shots};
 use crate::phantom::sight::Sight;
-use crate::phantom::subjects::{Moving, Patient, PatientFiles, Placed, Pose, Reading, Subject, Thorax, Volumes};
+use crate::phantom::subjects::{Build, Moving, Patient, PatientFiles, Placed, Pose, Reading, Subject, Thorax, Volumes};
 use crate::phantom::tree::Tree;
 use crate::phantom::tree_file::{TREE, TreeFile};
 use crate::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
@@ -33,14 +34,17 @@ const MASK_SHARE: f64 = 0.05;
 /// Attenuation of a blade as a multiple of the largest line integral of its view.
 const BLADE_DENSITY: f32 = 2.0;
 
-/// Published set-up of C-arm and volume.
+/// Procedural anatomy with its C-arm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
 pub enum Setting {
-    /// The authors' XCAT set-up: DSD 2500, DSO 450, 0.25 mm voxels.
+    /// XCAT set-up of the authors: DSD 2500, DSO 450, a body that is half as large as an adult's, cut to their volume of
+    /// 128 x 128 x 100 mm.
     Xcat,
-    /// The authors' MAGIX set-up: DSD 2000, DSO 600, 0.9 mm voxels.
+    /// The C-arm and attenuations of [`Setting::Xcat`] with a smaller body, 0.37 of an adult's, in a cube of 128 mm.
+    SmallXcat,
+    /// MAGIX set-up of the authors: DSD 2000, DSO 600, 0.9 mm voxels.
     Magix,
 }
 
@@ -479,12 +483,23 @@ fn add(image: &mut [f32], other: &[f32], factor: f32) {
 fn procedural(options: &PhantomOptions) -> Result<Stage> {
     let scale_pixels = 200.0 / options.size as f64;
     // Volume offsets are given in the world's axes (posterior, left, superior); LPS exchanges the first two.
-    let (tissues, sid_mm, sod_mm, anatomy_scale, centre_mm, half_mm) = match options.setting {
-        Setting::Xcat => (Tissues::XCAT, 2500.0, 450.0, 0.37, DVec3::new(-25.0, 10.0, 25.0), 64.0),
-        Setting::Magix => (Tissues::MAGIX, 2000.0, 600.0, 0.62, DVec3::ZERO, 230.0),
+    let small_xcat = Build {
+        tissues: Tissues::XCAT,
+        scale: 0.37,
+        centre_mm: DVec3::new(-25.0, 10.0, 25.0),
+        half_mm: DVec3::splat(64.0),
     };
-    let thorax = Thorax::new(tissues, anatomy_scale, options.seed, options.phases, (centre_mm, half_mm));
-    let radius = half_mm + centre_mm.x.abs().max(centre_mm.y.abs());
+    let (build, sid_mm, sod_mm) = match options.setting {
+        // The authors state voxels of 0.5 mm and project them as voxels of 0.25 mm, so the body is half as large as an adult's.
+        Setting::Xcat => (Build { scale: 0.5, half_mm: DVec3::new(64.0, 64.0, 50.0), ..small_xcat }, 2500.0, 450.0),
+        Setting::SmallXcat => (small_xcat, 2500.0, 450.0),
+        Setting::Magix => {
+            let half_mm = DVec3::splat(230.0);
+            (Build { tissues: Tissues::MAGIX, scale: 0.62, centre_mm: DVec3::ZERO, half_mm }, 2000.0, 600.0)
+        }
+    };
+    let thorax = Thorax::new(build, options.seed, options.phases);
+    let radius = build.half_mm.max_element() + build.centre_mm.x.abs().max(build.centre_mm.y.abs());
     let c_arms = CArmOptions {
         sod_mm: vec![sod_mm],
         sid_mm: vec![sid_mm],
@@ -493,10 +508,10 @@ fn procedural(options: &PhantomOptions) -> Result<Stage> {
     }
     .c_arms(&options.views, options.size)?;
     Ok(Stage {
-        description: format!("procedural phantom, {:?} set-up, seed {}", options.setting, options.seed),
+        description: format!("procedural phantom, {} set-up, seed {}", options.setting.name(), options.seed),
         depth_half_extent_mm: (radius * std::f64::consts::SQRT_2).min(largest_depth_mm(&c_arms)),
         c_arms,
-        vessel_attenuation: Some(tissues.vessel),
+        vessel_attenuation: Some(build.tissues.vessel),
         phases: options.phases,
         still: false,
         subject: Box::new(thorax),

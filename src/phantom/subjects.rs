@@ -85,10 +85,21 @@ pub(super) trait Subject {
     }
 }
 
+/// Tissues and extents of a procedural thorax.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Build {
+    pub(super) tissues: Tissues,
+    /// Size of the anatomy as a share of an adult's.
+    pub(super) scale: f64,
+    /// Centre of the volume with all tissue but the vessels, LPS mm.
+    pub(super) centre_mm: DVec3,
+    /// Half sides of this volume, mm.
+    pub(super) half_mm: DVec3,
+}
+
 /// A procedural heart in a procedural thorax.
 pub(super) struct Thorax {
-    tissues: Tissues,
-    scale: f64,
+    build: Build,
     seed: u32,
     heart_mm: DVec3,
     heart: Heart,
@@ -97,38 +108,39 @@ pub(super) struct Thorax {
 }
 
 impl Thorax {
-    /// Makes a thorax in a cube, with the middle of its tree at the isocentre, as on a real table.
-    pub(super) fn new(
-        tissues: Tissues,
-        scale: f64,
-        seed: u32,
-        phases: u32,
-        (centre_mm, half_mm): (DVec3, f64),
-    ) -> Thorax {
+    /// Makes a thorax, with the middle of its tree at the isocentre, as on a real table.
+    pub(super) fn new(build: Build, seed: u32, phases: u32) -> Thorax {
+        let scale = build.scale;
         let heart = Heart::new(DVec3::ZERO, scale);
         let bounds = Bounds::over_the_beat(phases, |fraction| Tree::procedural(&heart, scale, fraction, seed));
         let heart_mm = -0.5 * (bounds.low_mm + bounds.high_mm);
         let heart = Heart::new(heart_mm, scale);
         let bounds = Bounds::over_the_beat(phases, |fraction| Tree::procedural(&heart, scale, fraction, seed));
-        let still = voxels::thorax(tissues, heart_mm, scale, centre_mm, half_mm);
-        Thorax { tissues, scale, seed, heart_mm, heart, bounds, still }
+        let still = voxels::thorax(build.tissues, heart_mm, scale, build.centre_mm, build.half_mm);
+        Thorax { build, seed, heart_mm, heart, bounds, still }
     }
 
     fn tree(&self, fraction: f64) -> Tree {
-        Tree::procedural(&self.heart, self.scale, fraction, self.seed)
+        Tree::procedural(&self.heart, self.build.scale, fraction, self.seed)
     }
 
     fn vessels(&self, tree: &Tree) -> Volume {
-        voxels::vessels(tree, self.bounds.joined(tree.bounds()), self.tissues.vessel, self.vessel_voxel_mm())
+        voxels::vessels(tree, self.bounds.joined(tree.bounds()), self.build.tissues.vessel, self.vessel_voxel_mm())
+    }
+
+    fn catheter(&self, [rest, tip]: [DVec3; 2]) -> Volume {
+        let Build { tissues, scale, .. } = self.build;
+        catheter::volume(tip, rest, scale, tissues.vessel, self.vessel_voxel_mm())
     }
 
     fn vessel_voxel_mm(&self) -> f64 {
-        0.4 * self.scale
+        0.4 * self.build.scale
     }
 
     fn background(&self, fraction: f64, breath: Breath) -> Volume {
         let squeeze = contraction(fraction);
-        voxels::heart_and_diaphragm(self.tissues, &self.heart, squeeze, breath, self.heart_mm, self.scale, &self.still)
+        let Build { tissues, scale, .. } = self.build;
+        voxels::heart_and_diaphragm(tissues, &self.heart, squeeze, breath, self.heart_mm, scale, &self.still)
     }
 }
 
@@ -139,9 +151,7 @@ impl Subject for Thorax {
 
     fn moving(&self, projector: &Projector, pose: &Pose) -> Result<Moving> {
         let tree = self.tree(pose.fraction);
-        let catheter = pose
-            .catheter_between(&self.tree(0.0), &tree)
-            .map(|[rest, tip]| catheter::volume(tip, rest, self.scale, self.tissues.vessel, self.vessel_voxel_mm()));
+        let catheter = pose.catheter_between(&self.tree(0.0), &tree).map(|ends| self.catheter(ends));
         Ok(Moving {
             background: Some(Placed::at_rest(projector.load(self.background(pose.fraction, pose.breath))?)),
             vessels: Some(Placed {

@@ -25,17 +25,17 @@ impl Tissues {
     pub const MAGIX: Tissues = Tissues { soft: 3.8e-5, lung: 1.5e-5, bone: 5.5e-5, vessel: 5e-4 };
 }
 
-/// Number of background voxels along each side of the volume.
+/// Number of background voxels along the left-right axis of the volume; voxels are cubes.
 const BACKGROUND_VOXELS: usize = 128;
 
-/// Makes a cube of half side `half_mm` around `centre` (LPS mm) from a function of position.
-fn fill(centre: DVec3, half_mm: f64, value: impl Fn(DVec3) -> f64 + Sync) -> Volume {
-    let n = BACKGROUND_VOXELS;
-    let spacing = 2.0 * half_mm / n as f64;
-    let mut volume = Volume::centred([n; 3], spacing, centre, vec![0.0; n * n * n]);
+/// Makes a box of half sides `half_mm` around `centre` (LPS mm) from a function of position.
+fn fill(centre: DVec3, half_mm: DVec3, value: impl Fn(DVec3) -> f64 + Sync) -> Volume {
+    let spacing = 2.0 * half_mm.x / BACKGROUND_VOXELS as f64;
+    let size @ [nx, ny, nz] = half_mm.to_array().map(|half| (2.0 * half / spacing).round() as usize);
+    let mut volume = Volume::centred(size, spacing, centre, vec![0.0; nx * ny * nz]);
     let to_lps = volume.index_to_lps;
-    volume.values.par_chunks_mut(n).enumerate().for_each(|(row, values)| {
-        let (y, z) = (row % n, row / n);
+    volume.values.par_chunks_mut(nx).enumerate().for_each(|(row, values)| {
+        let (y, z) = (row % ny, row / ny);
         for (x, v) in values.iter_mut().enumerate() {
             *v = value(to_lps.transform_point3(DVec3::new(x as f64, y as f64, z as f64))) as f32;
         }
@@ -54,8 +54,9 @@ fn ellipsoid(p: DVec3, centre: DVec3, radii: DVec3) -> f64 {
     (q.length() - 1.0) * radii.min_element()
 }
 
-/// Static part of a thorax: body, lungs, ribs, spine. `scale` scales the anatomy around the heart at `heart_mm`.
-pub fn thorax(tissues: Tissues, heart_mm: DVec3, scale: f64, centre_mm: DVec3, half_mm: f64) -> Volume {
+/// Static part of a thorax: body, lungs, ribs, spine. `scale` scales the anatomy around the heart at `heart_mm`. The volume is a
+/// box of half sides `half_mm` around `centre_mm`; nothing attenuates outside it.
+pub fn thorax(tissues: Tissues, heart_mm: DVec3, scale: f64, centre_mm: DVec3, half_mm: DVec3) -> Volume {
     let edge = 3.0 * scale;
     fill(centre_mm, half_mm, |lps| {
         // Anatomical coordinates, mm; the heart lies to the left of the spine and in front of it.

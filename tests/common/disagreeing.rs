@@ -58,7 +58,7 @@ impl Studio {
         let fraction = |t: u32| f64::from(t) / f64::from(PHASES);
         let trees: Vec<Tree> = (0..PHASES).map(|t| Tree::procedural(&heart, SCALE, fraction(t), seed)).collect();
         let bounds = trees[1..].iter().map(Tree::bounds).fold(trees[0].bounds(), Bounds::joined);
-        let still = voxels::thorax(Tissues::XCAT, shift, SCALE, DVec3::new(-25.0, 10.0, 25.0), 64.0);
+        let still = voxels::thorax(Tissues::XCAT, shift, SCALE, DVec3::new(-25.0, 10.0, 25.0), DVec3::splat(64.0));
         let projector = Projector::new(gpu, size, size).unwrap();
         let load = |volume| projector.load(volume).unwrap();
         let beat = |t: u32| {

@@ -83,7 +83,7 @@ pub fn expect_agreement(compare: impl FnOnce(&mut Findings) -> Result<()>) {
 /// The default procedural phantom without photon noise, with its vessel volumes.
 pub fn phantom(gpu: &Gpu, directory: &Path, size: usize, views: u32) -> Dataset {
     let options = PhantomOptions {
-        setting: Setting::Xcat,
+        setting: Setting::SmallXcat,
         size,
         phases: 10,
         views: ViewAngles::published(views).unwrap(),

@@ -218,7 +218,7 @@ fn views_that_have_nothing_to_do_with_each_other_are_told() {
 /// A procedural phantom of six phases, in which the heart moves as well as the vessels.
 fn phantom_of_six_phases() -> Dataset {
     let options = PhantomOptions {
-        setting: Setting::Xcat,
+        setting: Setting::SmallXcat,
         size: 100,
         phases: 6,
         views: ViewAngles::published(4).unwrap(),

@@ -83,7 +83,7 @@ fn views() -> ViewAngles {
 
 fn options(degradations: Degradations, anatomy: Option<Anatomy>) -> PhantomOptions {
     PhantomOptions {
-        setting: Setting::Xcat,
+        setting: Setting::SmallXcat,
         size: SIZE,
         phases: PHASES,
         views: views(),
@@ -190,7 +190,7 @@ fn thorax_at(fraction: f64, phases: u32) -> (Volume, [Volume; 2]) {
     let bounds = Bounds::over_the_beat(phases, |fraction| tree_of(&heart, fraction));
     let tree = tree_of(&heart, fraction);
     let vessels = voxels::vessels(&tree, bounds.joined(tree.bounds()), tissues.vessel, 0.4 * SCALE);
-    let still = voxels::thorax(tissues, heart_mm, SCALE, DVec3::new(-25.0, 10.0, 25.0), 64.0);
+    let still = voxels::thorax(tissues, heart_mm, SCALE, DVec3::new(-25.0, 10.0, 25.0), DVec3::splat(64.0));
     let squeeze = contraction(fraction);
     let moving = voxels::heart_and_diaphragm(tissues, &heart, squeeze, Breath::default(), heart_mm, SCALE, &still);
     (vessels, [still, moving])

@@ -37,7 +37,7 @@ fn phantom(gpu: &Gpu, views: u32) -> Phantom {
     let directory = tempfile::tempdir().unwrap();
     let out = directory.path().join("phantom");
     let options = PhantomOptions {
-        setting: Setting::Xcat,
+        setting: Setting::SmallXcat,
         size: 100,
         phases: PHASES,
         views: ViewAngles::published(views).unwrap(),

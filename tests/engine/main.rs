@@ -28,6 +28,7 @@ mod kept_pipelines;
 mod kernels_vs_cpu;
 mod live_pictures;
 mod networks;
+mod phantom_settings;
 mod projector;
 mod refits;
 mod schedules;

@@ -25,7 +25,7 @@ const CARRIED: u32 = 40;
 fn phantom(gpu: &Gpu) -> (tempfile::TempDir, Dataset) {
     let directory = tempfile::tempdir().unwrap();
     let options = PhantomOptions {
-        setting: Setting::Xcat,
+        setting: Setting::SmallXcat,
         anatomy: None,
         size: 64,
         phases: PHASES,

@@ -164,7 +164,7 @@ fn read_report(file: &Path) -> Result<Report> {
 fn default_phantom(gpu: &Gpu, scratch: &Path) -> Result<Dataset> {
     let directory = scratch.join("phantom");
     let options = PhantomOptions {
-        setting: Setting::Xcat,
+        setting: Setting::SmallXcat,
         size: 100,
         phases: 10,
         views: ViewAngles::published(4)?,

@@ -22,8 +22,9 @@ pub struct PhantomArgs {
     /// Replace a dataset that the directory already contains.
     #[arg(short, long)]
     pub force: bool,
-    /// C-arm and volume of a published set-up: `xcat` (DSD 2500, DSO 450) or `magix` (DSD 2000, DSO 600).
-    #[arg(long, value_parser = choice::<Setting>(), default_value = Setting::Xcat.name())]
+    /// Procedural anatomy and C-arm: `small-xcat` (DSD 2500, DSO 450, body of 0.37 of an adult's size), `xcat` (the same with a
+    /// body of half an adult's size, as in the authors' volume) or `magix` (DSD 2000, DSO 600).
+    #[arg(long, value_parser = choice::<Setting>(), default_value = Setting::SmallXcat.name())]
     pub geometry: Setting,
     /// Columns and rows of the images.
     #[arg(long, default_value_t = 100)]

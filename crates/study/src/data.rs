@@ -34,7 +34,7 @@ const USUAL_C_ARM_MM: [f64; 3] = [750.0, 1100.0, 160.0];
 #[derive(Debug, Clone, Default, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct PhantomSection {
-    /// Published set-up: `xcat` or `magix`.
+    /// Procedural anatomy with its C-arm: `small-xcat`, `xcat` or `magix`.
     geometry: Option<Setting>,
     /// Columns and rows of the images.
     size: Option<usize>,
@@ -214,6 +214,18 @@ fn take_in(fingerprint: &mut Fingerprint, path: &Path) -> Result<()> {
     std::io::copy(&mut file, fingerprint).map_err(Error::io("read", path)).map(drop)
 }
 
+/// Geometries whose names changed after results were first recorded: as stated now, as in fingerprints.
+const RENAMED_GEOMETRIES: [(&str, &str); 2] = [
+    (r#""geometry":"xcat""#, r#""geometry":"xcat-half-size""#),
+    (r#""geometry":"small-xcat""#, r#""geometry":"xcat""#),
+];
+
+/// Gives a geometry the name that it had when results were first recorded, so that these keep their fingerprint.
+fn as_before(section: String) -> String {
+    let renamed = RENAMED_GEOMETRIES.iter().find(|(now, _)| section.contains(now));
+    renamed.map_or_else(|| section.clone(), |(now, before)| section.replace(now, before))
+}
+
 /// Expands a section into data sets, one for each number of views.
 pub(super) fn phantoms(
     name: &str,
@@ -239,9 +251,9 @@ pub(super) fn phantoms(
         degradations.check(angles.training.len(), Layout::Native).map_err(|e| e.to_string())?;
         let stated = PhantomSection { views: Some(vec![views]), ..section.clone() };
         let mut fingerprint = files;
-        fingerprint.bytes(&serde_json::to_vec(&stated).map_err(|e| e.to_string())?);
+        fingerprint.bytes(as_before(serde_json::to_string(&stated).map_err(|e| e.to_string())?).as_bytes());
         let options = PhantomOptions {
-            setting: section.geometry.unwrap_or(Setting::Xcat),
+            setting: section.geometry.unwrap_or(Setting::SmallXcat),
             size: section.size.unwrap_or(USUAL_SIZE),
             phases: section.phases.unwrap_or(USUAL_PHASES),
             views: angles,
