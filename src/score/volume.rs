@@ -9,6 +9,7 @@ use crate::model::scene::Scene;
 use crate::render::grid::PatientGrid;
 use crate::render::renderer::Renderer;
 use crate::scan::dataset::Dataset;
+use crate::score::metrics::dice;
 use crate::score::shapes::{Agreement, WITHIN_MM, compare};
 use crate::vessels::distances::DistanceMap;
 use crate::vessels::field::{CoarseField, Corners, VesselField};
@@ -20,8 +21,8 @@ use std::path::{Path, PathBuf};
 
 /// Directory of the volumes inside a dataset.
 pub const VOLUMES: &str = "volumes";
-/// A voxel of the truth is vessel from this share of the vessel attenuation.
-const TRUTH_SHARE: f64 = 0.5;
+/// Share of the vessel attenuation above which a voxel of the truth is vessel, and one of the field is lumen.
+const LUMEN_SHARE: f64 = 0.5;
 /// Distance from a vessel beyond which attenuation is far from it, pixels.
 const FAR_PIXELS: f64 = 2.0;
 /// Distance from a vessel beyond which attenuation is far from it, mm.
@@ -37,6 +38,9 @@ pub struct Scores {
     /// Agreement of the reconstructed vessels with the true ones.
     #[serde(flatten)]
     pub agreement: Agreement,
+    /// Dice of the lumen: voxels at which the dynamic field exceeds half of the stated vessel attenuation, the rule for voxels of the
+    /// truth. `None` where no vessel attenuation is stated.
+    pub lumen_dice: Option<f64>,
     /// Share of the dynamic field's attenuation farther than 2 pixels at the isocentre from the nearest true vessel voxel.
     pub mass_beyond_2_pixels: Option<f64>,
     /// Share of the dynamic field's attenuation that lies more than 2 mm from a true vessel.
@@ -94,6 +98,7 @@ pub fn score(
     mut proceed: impl FnMut() -> Result<()>,
 ) -> Result<Option<VolumeScores>> {
     let pixel_mm = pixel_mm(dataset);
+    let lumen_per_mm = lumen_per_mm(dataset);
     let least_mm3 = smallest_component_mm3(pixel_mm);
     let volumes = dataset.path.join(VOLUMES);
     let (mut phases, mut as_stated) = (Vec::new(), Vec::new());
@@ -108,7 +113,7 @@ pub fn score(
         let mut against = |volume: &Volume| -> Result<PhaseScores> {
             proceed()?;
             let truth = TrueVessels::new(volume, dataset);
-            Ok(PhaseScores { phase, scores: scores(&field, &coarse, &truth, &file, least_mm3)? })
+            Ok(PhaseScores { phase, scores: scores(&field, &coarse, &truth, &file, (least_mm3, lumen_per_mm))? })
         };
         match carried {
             None => phases.push(against(&volume)?),
@@ -125,7 +130,7 @@ pub fn score(
 }
 
 /// Scores the dynamic field where it exceeds `threshold_per_mm` at the phases whose true vessels are known; `None` if none
-/// are. A pixel has `pixel_mm` at the isocentre.
+/// are. `dataset` states the size of a pixel at the isocentre and the attenuation of vessels.
 ///
 /// # Errors
 /// [`Error::Data`] for a truth that has too many voxels; device errors.
@@ -134,16 +139,23 @@ pub fn score_known(
     scene: &Scene,
     known: &BTreeMap<u32, TrueVessels>,
     threshold_per_mm: f64,
-    pixel_mm: f64,
+    dataset: &Dataset,
 ) -> Result<Option<VolumeScores>> {
+    let (pixel_mm, lumen_per_mm) = (pixel_mm(dataset), lumen_per_mm(dataset));
     let of_phase = |(phase, truth): (&u32, &TrueVessels)| -> Result<PhaseScores> {
         let field = VesselField { renderer, scene, phase: *phase, pixel_mm, threshold_per_mm };
         let of = PathBuf::from(format!("true vessels of phase {phase}"));
         let least_mm3 = smallest_component_mm3(pixel_mm);
-        Ok(PhaseScores { phase: *phase, scores: scores(&field, &field.coarse()?, truth, &of, least_mm3)? })
+        let scores = scores(&field, &field.coarse()?, truth, &of, (least_mm3, lumen_per_mm))?;
+        Ok(PhaseScores { phase: *phase, scores })
     };
     let phases = known.iter().map(of_phase).collect::<Result<Vec<_>>>()?;
     Ok((!phases.is_empty()).then(|| VolumeScores::of(phases, threshold_per_mm, pixel_mm)))
+}
+
+/// Attenuation above which the dynamic field is lumen, per mm.
+fn lumen_per_mm(dataset: &Dataset) -> Option<f64> {
+    dataset.vessel_attenuation.map(|attenuation| LUMEN_SHARE * attenuation / MM_PER_UNIT)
 }
 
 /// Minimum volume of a counted component, for a pixel size at the isocentre.
@@ -182,6 +194,7 @@ fn mean(phases: &[PhaseScores]) -> Scores {
             components: of_all(|a| a.components),
             true_components: of_all(|a| a.true_components),
         },
+        lumen_dice: mean(&|s| s.lumen_dice),
         mass_beyond_2_pixels: mean(&|s| s.mass_beyond_2_pixels),
         mass_beyond_2_mm: mean(&|s| s.mass_beyond_2_mm),
     }
@@ -224,7 +237,7 @@ impl TrueVessels {
     pub(super) fn new(volume: &Volume, dataset: &Dataset) -> TrueVessels {
         let largest = || f64::from(volume.values.iter().copied().fold(0.0, f32::max));
         let vessel_per_mm = dataset.vessel_attenuation.map(|v| v / MM_PER_UNIT);
-        let threshold = TRUTH_SHARE * vessel_per_mm.unwrap_or_else(largest);
+        let threshold = LUMEN_SHARE * vessel_per_mm.unwrap_or_else(largest);
         TrueVessels {
             grid: PatientGrid {
                 origin_mm: volume.index_to_lps.translation,
@@ -314,18 +327,24 @@ pub(super) fn on_one_grid(
     Ok((grid, [true_vessels, ours]))
 }
 
-/// Scores of a field against the truth.
+/// Scores of a field against the truth. Components count from the first of the two limits on, in mm³; the field is lumen above the
+/// second, per mm.
 fn scores(
     field: &VesselField<'_>,
     coarse: &CoarseField,
     truth: &TrueVessels,
     file: &Path,
-    smallest_component_mm3: f64,
+    (smallest_component_mm3, lumen_per_mm): (f64, Option<f64>),
 ) -> Result<Scores> {
     let (grid, [true_vessels, ours]) = on_one_grid(field, coarse, truth, file)?;
     let mass = DistanceMap::to(&true_vessels).map(|to_truth| Mass::of(coarse, &grid, &to_truth, field.pixel_mm));
+    let dice_above = |threshold_per_mm: f64| -> Result<f64> {
+        let lumen = VesselField { threshold_per_mm, ..*field }.vessels(coarse, &grid)?;
+        Ok(dice(&true_vessels.inside, &lumen))
+    };
     Ok(Scores {
         agreement: compare(&true_vessels, &ours, smallest_component_mm3)?,
+        lumen_dice: lumen_per_mm.map(dice_above).transpose()?,
         mass_beyond_2_pixels: mass.and_then(|m| m.share(m.far_pixels)),
         mass_beyond_2_mm: mass.and_then(|m| m.share(m.far_mm)),
     })

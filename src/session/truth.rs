@@ -5,7 +5,7 @@ use crate::geometry::MM_PER_UNIT;
 use crate::scan::gating::BeatTime;
 use crate::score::eval::{Evaluation, evaluate, moving_field_warning};
 use crate::score::trees::{self, TrueLine};
-use crate::score::volume::{MAX_VOXELS, TrueVessels, pixel_mm, score_known};
+use crate::score::volume::{MAX_VOXELS, TrueVessels, score_known};
 use crate::session::Session;
 use crate::session::engine::lock;
 use crate::session::known::{between, check_lines};
@@ -79,7 +79,7 @@ impl Session {
             let renderer = live.renderer(step)?;
             let mut evaluation = evaluate(renderer, &dataset, &frames, step, threshold, |_| call.check())?;
             let threshold_per_mm = evaluation.threshold.dynamic_per_mm;
-            evaluation.volume = score_known(renderer, live.scene(), &volumes, threshold_per_mm, pixel_mm(&dataset))?;
+            evaluation.volume = score_known(renderer, live.scene(), &volumes, threshold_per_mm, &dataset)?;
             evaluation.warnings.extend(moving_field_warning(renderer, &dataset)?);
             Ok(evaluation)
         })?;

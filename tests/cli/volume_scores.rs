@@ -202,6 +202,13 @@ fn a_field_agrees_with_itself() {
         }
         assert_eq!(row["components"], row["true_components"], "{row}");
     }
+    // The lumen is the part of the field above half of the stated attenuation.
+    for (field, row) in trained().fields.iter().zip(rows) {
+        let (truth, lumen) =
+            (above(field, THRESHOLD_PER_MM).len() as f64, above(field, 0.5 * VESSEL_PER_MM).len() as f64);
+        let expected = 2.0 * lumen / (truth + lumen);
+        assert!(expected < 0.95 && (number(row, "lumen_dice") - expected).abs() < 2e-3, "{expected} in {row}");
+    }
 }
 
 /// Translations by whole voxels along each patient axis, which differ from the world's axes.
@@ -261,7 +268,7 @@ fn reports_show_scores_in_3d_and_do_without() {
     let Trained { directory, run, .. } = trained();
     let report: Value = serde_json::from_slice(&std::fs::read(run.join("report/evaluation.json")).unwrap()).unwrap();
     let (rows, mean) = (report["volume"]["phases"].as_array().unwrap(), &report["volume"]["mean"]);
-    for name in ["dice", "chamfer_mm", "true_components", "mass_beyond_2_pixels"] {
+    for name in ["dice", "lumen_dice", "chamfer_mm", "true_components", "mass_beyond_2_pixels"] {
         let expected = rows.iter().map(|row| number(row, name)).sum::<f64>() / f64::from(PHASES);
         assert!((number(mean, name) - expected).abs() < 1e-9, "{name}: {expected} in {mean}");
     }

@@ -3,8 +3,9 @@
 use super::score_table::{Column, ScoreTable, mm, percent};
 use nertca_vk::score::volume::{Scores, VolumeScores};
 
-const COLUMNS: [Column<Scores>; 10] = [
+const COLUMNS: [Column<Scores>; 11] = [
     Column { heading: ["3D", "Dice"], text: |s| format!("{:.3}", s.agreement.dice) },
+    Column { heading: ["lumen", "Dice"], text: |s| s.lumen_dice.map_or("-".into(), |v| format!("{v:.3}")) },
     Column { heading: ["Chamfer", "mm"], text: |s| mm(s.agreement.chamfer_mm) },
     Column { heading: ["Hausdorff", "95 %, mm"], text: |s| mm(s.agreement.hausdorff95_mm) },
     Column { heading: ["centreline", "found"], text: |s| percent(s.agreement.true_centreline_found) },
@@ -25,7 +26,8 @@ pub fn table(volume: &VolumeScores) -> ScoreTable {
 /// Describes the numbers of the table.
 fn legend(volume: &VolumeScores) -> String {
     format!(
-        "A voxel is vessel where the dynamic field exceeds {:.4e} per mm. Centrelines agree where their distance is at \
+        "A voxel is vessel where the dynamic field exceeds {:.4e} per mm, and lumen where it exceeds half of the stated vessel \
+         attenuation, as voxels of the truth do. Centrelines agree where their distance is at \
          most {} mm, and components count if they have at least {:.3} mm³; a pixel at the isocentre is {:.3} mm wide.",
         volume.threshold_per_mm, volume.within_mm, volume.smallest_component_mm3, volume.pixel_mm
     )
