@@ -116,6 +116,7 @@ pub mod scan {
     pub(crate) mod hidden;
     pub mod nerfca;
     pub mod pixels;
+    pub mod prior;
     mod reading;
     pub(crate) mod same_view;
     pub mod truth;
@@ -285,6 +286,7 @@ pub mod run {
     pub mod hull_pictures;
     pub mod info;
     mod log;
+    pub mod prior;
     pub mod reconstruct;
     pub mod score;
     pub mod silhouette_pictures;

@@ -108,6 +108,7 @@ fn coarsened(dataset: &Dataset, factor: usize) -> Dataset {
         views: dataset.views.clone(),
         path: dataset.path.clone(),
         notes: Vec::new(),
+        prior: dataset.prior.clone(),
         ..*dataset
     };
     for view in &mut coarse.views {

@@ -16,6 +16,7 @@ mod made;
 mod members;
 mod memory;
 pub mod per_phase;
+mod prior;
 mod pruning;
 pub mod remainder;
 mod repeated;

@@ -148,8 +148,8 @@ impl TreeFile {
         Tree { branches: self.branches.iter().map(branch).collect() }
     }
 
-    /// Trees of the stored phases.
-    pub(super) fn stored(&self) -> impl Iterator<Item = Tree> {
+    /// Trees of the stored phases, at equal fractions of the beat.
+    pub fn stored(&self) -> impl Iterator<Item = Tree> {
         let stored = self.points_mm.len();
         (0..stored).map(move |phase| self.at(phase as f64 / stored as f64))
     }

@@ -153,6 +153,7 @@ impl Builder {
             depth_range: self.depth_range,
             vessel_attenuation: self.vessel_attenuation,
             still: self.still,
+            prior: None,
             notes: self.notes,
         };
         dataset.hide();

@@ -3,10 +3,12 @@
 use crate::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays, is_at_rest};
 use crate::scan::gating::BeatTime;
 use crate::scan::pixels::Pixels;
+use crate::scan::prior::VesselPrior;
 use glam::DVec3;
 use serde::{Deserialize, Serialize, Serializer};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::sync::Arc;
 use strum::{IntoStaticStr, VariantArray};
 
 /// Name of the manifest inside a native dataset.
@@ -230,6 +232,8 @@ pub struct Dataset {
     pub vessel_attenuation: Option<f64>,
     /// Whether the object is at rest: phase 0 shows it, and phase 1 is the same without vessels.
     pub still: bool,
+    /// Vessels that are known before the images are read.
+    pub prior: Option<Arc<VesselPrior>>,
     /// Findings on reading that are no errors but may be unintended.
     pub notes: Vec<String>,
 }

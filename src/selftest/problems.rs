@@ -82,6 +82,7 @@ pub fn small_dataset(width: usize, height: usize, n_phases: u32) -> Result<Datas
         hidden: Default::default(),
         vessel_attenuation: Some(1.0),
         still: false,
+        prior: None,
         notes: Vec::new(),
     })
 }
@@ -229,7 +230,7 @@ pub fn deformable_case() -> Result<(Targets, Vec<Gaussian>, Config)> {
         .for_each(|(view, after)| view.after_phase = after);
     targets.rest_phase = 3;
     // The grid covers the places.
-    let corner = PossibleVessel { position: DVec3::splat(14.0), evidence: 18.0 };
+    let corner = PossibleVessel { position: DVec3::splat(14.0), evidence: 18.0, far_from_prior: 0.0 };
     targets.places[0].push(corner);
     let mut rows = random_gaussians(31, 1, 11.0, 8);
     rows[3].position = [300.0, 0.0, 0.0];

@@ -294,6 +294,7 @@ impl Inbox {
             depth_range: (-half, half),
             vessel_attenuation: self.options.vessel_attenuation_per_mm.map(|a| a * MM_PER_UNIT),
             still: self.options.still,
+            prior: None,
             notes,
         };
         dataset.hide();

@@ -367,6 +367,7 @@ mod tests {
             hidden: Default::default(),
             vessel_attenuation: None,
             still: false,
+            prior: None,
         }
     }
 

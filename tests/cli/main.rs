@@ -36,6 +36,7 @@ mod motion;
 mod moving_runs;
 mod network_runs;
 mod positions;
+mod prior;
 mod run_directories;
 mod selftest;
 mod study;

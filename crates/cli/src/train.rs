@@ -9,7 +9,9 @@ use super::tree::{of_page as tree_of_page, remove_old as remove_old_tree, score 
 use clap::Args;
 use clap::error::ErrorKind;
 use nertca_vk::checkpoint::{self, newest_model};
+use nertca_vk::choice::Choice;
 use nertca_vk::config::Config;
+use nertca_vk::config::method::MethodKind;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::{self, Lock};
 use nertca_vk::formats::nrrd;
@@ -17,11 +19,14 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::run::events::Event;
 use nertca_vk::run::info::RunInfo;
+use nertca_vk::run::prior;
 use nertca_vk::run::reconstruct::{CONFIG, RunOptions, reconstruct};
 use nertca_vk::run::score::{ScoreOptions, as_trained, evaluate_model};
 use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::scan::prior::{PRIOR, VesselPrior};
 use nertca_vk::score::eval::{Evaluation, moving_field_warning};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Arguments of `train`.
 #[derive(Debug, Args)]
@@ -40,6 +45,11 @@ pub struct TrainArgs {
     /// Seed (same as --set seed=S).
     #[arg(long, value_name = "S")]
     pub seed: Option<u32>,
+    /// Vessels that are known before, e.g. from a CT: a tree (.json, .vtp, .pvd) or a volume with the vessels as its brightest voxels
+    /// (.nrrd, .nii, .mha), in patient coordinates with the isocentre at the origin. It decides where vessels are sought first; the
+    /// views decide whether they are there. For `fast`.
+    #[arg(long, value_name = "FILE", conflicts_with = "resume")]
+    pub prior: Option<PathBuf>,
     /// Continue from the newest checkpoint in RUN, with its configuration.
     #[arg(long, conflicts_with_all = ["preset", "config", "set", "iterations", "seed"])]
     pub resume: bool,
@@ -94,7 +104,8 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     let Some(data) = &args.data else {
         clap::Error::raw(ErrorKind::MissingRequiredArgument, NO_DATA).exit();
     };
-    let dataset = Dataset::open(data)?;
+    let mut dataset = Dataset::open(data)?;
+    let prior = prior(args, &config)?;
     let run = &args.out.clone().map_or_else(|| default_run(data), Ok)?;
     if let Some(file) = &args.export_hull {
         return export_hull(&config, &dataset, file);
@@ -103,6 +114,7 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     let _lock = if args.resume && !run.exists() { None } else { Some(take_run(run)?) };
     prepare_directory(run, args)?;
     room_for_training()?;
+    dataset.prior = kept_prior(prior, run, args)?;
     let cancel = stop_flag()?;
     let gpu = global.open_device()?;
     RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) }.write(run)?;
@@ -197,6 +209,27 @@ fn resumed(run: &Path) -> Result<(Config, bool)> {
     }
     eprintln!("{}: there is no checkpoint yet, so the run starts over, with its own configuration", run.display());
     Ok((Config::load(None, Some(&config), &[])?, false))
+}
+
+/// Reads the prior vessels that the command line names.
+fn prior(args: &TrainArgs, config: &Config) -> Result<Option<VesselPrior>> {
+    let Some(file) = &args.prior else { return Ok(None) };
+    if config.method() != MethodKind::DynamicGaussians {
+        let problem = format!("is used by the preset `fast` only, and the preset is `{}`", config.preset.name());
+        return Err(Error::config("--prior", file.display(), problem));
+    }
+    prior::read(file).map(Some)
+}
+
+/// Keeps prior vessels in the run directory, where `--resume` finds them, and returns those of the run.
+fn kept_prior(prior: Option<VesselPrior>, run: &Path, args: &TrainArgs) -> Result<Option<Arc<VesselPrior>>> {
+    let kept = run.join(PRIOR);
+    match prior {
+        Some(prior) => prior.write(run)?,
+        None if !args.resume && kept.exists() => std::fs::remove_file(&kept).map_err(Error::io("remove", &kept))?,
+        None => {}
+    }
+    Ok(VesselPrior::read(run)?.map(Arc::new))
 }
 
 fn prepare_directory(run: &Path, args: &TrainArgs) -> Result<()> {

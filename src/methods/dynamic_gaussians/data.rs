@@ -7,6 +7,7 @@ use crate::fields::motion;
 use crate::fields::scale::dynamic_half;
 use crate::fitting::extent::between_phases;
 use crate::geometry::ViewRays;
+use crate::methods::dynamic_gaussians::prior;
 use crate::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::model::hull::Hull;
@@ -63,7 +64,10 @@ fn hull_and_targets(config: &Config, dataset: &Dataset, notes: &mut Vec<String>)
     let mut soft = SoftMotion::new(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
     // Only the hull is made of the ratios, which take as much memory as the images.
     soft.views.iter_mut().for_each(|view| view.ratios.clear());
-    let targets = Targets::new(dataset, &soft, &config.gaussians)?;
+    let mut targets = Targets::new(dataset, &soft, &config.gaussians)?;
+    if let Some(prior) = &dataset.prior {
+        notes.push(prior::apply(&mut targets, prior));
+    }
     let form = targets.form(config.gaussians.form);
     notes.extend(between_phases(
         dataset,

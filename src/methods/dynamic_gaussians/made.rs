@@ -59,7 +59,7 @@ pub(crate) fn fingerprint(targets: &Targets, config: &Config) -> String {
         fingerprint.bytes(format!("{view:?}").as_bytes());
     }
     for place in targets.places.iter().flatten() {
-        let numbers = place.position.to_array().into_iter().chain([place.evidence]);
+        let numbers = place.position.to_array().into_iter().chain([place.evidence, place.far_from_prior]);
         numbers.for_each(|v| fingerprint.bytes(&v.to_bits().to_le_bytes()));
     }
     let rest = (targets.units, targets.width, &targets.image_of, targets.lengths, targets.rest_phase, targets.cell);

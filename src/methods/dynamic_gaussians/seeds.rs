@@ -10,6 +10,8 @@ use glam::DVec3;
 
 /// Share of the data that the first images explain: Gaussians grow into the rest.
 const FIRST_SHARE: f64 = 0.7;
+/// Log-likelihood ratio against a place far from the vessels of a prior.
+const FAR_EVIDENCE: f64 = 12.0;
 /// Evidence of four views at which half of the cells hold vessel, and the width over which that share rises.
 const LIKELY_EVIDENCE: f64 = 14.0;
 const EVIDENCE_WIDTH: f64 = 1.5;
@@ -66,7 +68,8 @@ pub fn seeds(targets: &Targets, settings: &sections::Gaussians, seed: u32) -> Ve
     let mut all = Vec::new();
     for (phase, places) in targets.places.iter().enumerate() {
         let n_views = targets.views_at(phase).count();
-        let weights: Vec<f64> = places.iter().map(|p| likelihood(p.evidence, n_views)).collect();
+        let weights: Vec<f64> =
+            places.iter().map(|p| likelihood(p.evidence - FAR_EVIDENCE * p.far_from_prior, n_views)).collect();
         let draw = Draw { targets, settings, seed, round: phase as u32 };
         all.extend(draw.gaussians(&weights, settings.count as usize, phase, 1.0));
     }

@@ -29,6 +29,8 @@ pub struct PossibleVessel {
     pub position: DVec3,
     /// Evidence of all views for it: a log-likelihood ratio.
     pub evidence: f64,
+    /// Distance from the vessels of a prior: 0 near them or without a prior, 1 far from them.
+    pub far_from_prior: f64,
 }
 
 /// Data in the Gaussians' units.
@@ -199,6 +201,7 @@ impl Targets {
         let place = |c: &HullCell| PossibleVessel {
             position: motion.hull.centre(c.index) / units.pixel,
             evidence: f64::from(c.evidence),
+            far_from_prior: 0.0,
         };
         targets.places = motion.hull.cells.iter().map(|cells| cells.iter().map(place).collect()).collect();
         Ok(targets)
