@@ -278,6 +278,12 @@ impl ViewRays {
         ViewRays::at_depth(self.source(), [first, self.direction[1] * f, self.direction[2] * f], self.sod)
     }
 
+    /// Returns the rays through every `step`-th pixel along columns and rows, from the first one on.
+    pub fn every(&self, step: usize) -> ViewRays {
+        let ([first, column, row], f) = (self.direction, step as f64);
+        ViewRays::at_depth(self.source(), [first, column * f, row * f], self.sod)
+    }
+
     /// Returns the rays of an image whose first row is row `first` of this one.
     pub fn from_row(&self, first: usize) -> ViewRays {
         let (anchor, direction) = self.pixel(0.0, first as f64);

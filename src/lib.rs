@@ -281,6 +281,7 @@ pub mod phantom {
 
 /// One run, from a dataset to a run directory.
 pub mod run {
+    mod curve;
     pub mod events;
     pub mod history;
     pub mod hull_pictures;

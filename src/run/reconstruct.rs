@@ -18,6 +18,7 @@ use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
 use crate::methods;
 use crate::plan::Plan;
+use crate::run::curve::{thinned, validation_step};
 use crate::run::events::Event;
 use crate::run::log::MetricsLog;
 use crate::run::snapshots::{Answer, Job, SnapshotWorker};
@@ -109,7 +110,16 @@ pub fn reconstruct(
     notes.extend(calibration.notes);
     notes.extend(trainer.plan().notes.iter().cloned());
     notes.extend(trainer.tuning().reasons.iter().cloned());
-    let distance = match Distance::new(dataset, carried.as_ref()) {
+    let step = validation_step(&config, dataset);
+    let thin = (step > 1).then(|| thinned(dataset, step));
+    if step > 1 {
+        notes.push(format!(
+            "validation during training renders one of {step} x {step} pixels and measures no distances: with all, it would evaluate the \
+             network more than a tenth as often as training does; the scores of the finished run use all pixels"
+        ));
+    }
+    let measured = if step > 1 { Ok(None) } else { Distance::new(dataset, carried.as_ref()) };
+    let distance = match measured {
         // Images are scored nevertheless.
         Err(error @ (Error::Data { .. } | Error::Io { .. })) => {
             notes.push(format!("distances to the true vessels are not measured during training: {error}"));
@@ -131,8 +141,8 @@ pub fn reconstruct(
         gpu,
         tuning: options.tuning,
         run: options.run,
-        dataset,
-        validation: eval::spread_validation(dataset, config.train.validate_images as usize),
+        dataset: thin.as_ref().unwrap_or(dataset),
+        validation: eval::spread_validation(thin.as_ref().unwrap_or(dataset), config.train.validate_images as usize),
         distance,
         begin,
         cancel: options.cancel,
