@@ -15,7 +15,7 @@ const MAX_BYTES: u64 = 1 << 28;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct VesselPrior {
     /// Points in patient mm (LPS, with the isocentre at the origin), `[shape][point]`. Several shapes are at equal fractions of the
-    /// beat; a single one is that of end diastole.
+    /// beat; a single one counts for all of it.
     pub shapes_mm: Vec<Vec<[f64; 3]>>,
 }
 
