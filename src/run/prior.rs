@@ -34,14 +34,14 @@ pub fn read(path: &Path) -> Result<VesselPrior> {
     };
     let most = shapes.iter().map(Vec::len).max().unwrap_or(0);
     if most == 0 {
-        return Err(Error::data(path, "voxels", "contains no vessel: no voxel is positive"));
+        return Err(Error::data(path, "vessels", "no vessel is there: no voxel is positive"));
     }
     if most > MAX_POINTS {
         let problem = format!(
-            "the vessels of this prior fill {most} cubes of {STEP_MM} mm, more than {MAX_POINTS}: state the vessels alone, for \
-             example as the mask of a segmentation"
+            "there are {most} points at a distance of {STEP_MM} mm, more than {MAX_POINTS}: state the vessels alone, for example as \
+             the mask of a segmentation"
         );
-        return Err(Error::data(path, "voxels", problem));
+        return Err(Error::data(path, "vessels", problem));
     }
     Ok(VesselPrior { shapes_mm: shapes.iter().map(|shape| shape.iter().map(|p| p.to_array()).collect()).collect() })
 }

@@ -221,9 +221,11 @@ const RENAMED_GEOMETRIES: [(&str, &str); 2] = [
 ];
 
 /// Gives a geometry the name that it had when results were first recorded, so that these keep their fingerprint.
-fn as_before(section: String) -> String {
-    let renamed = RENAMED_GEOMETRIES.iter().find(|(now, _)| section.contains(now));
-    renamed.map_or_else(|| section.clone(), |(now, before)| section.replace(now, before))
+fn as_before(section: &str) -> String {
+    match RENAMED_GEOMETRIES.iter().find(|(now, _)| section.contains(now)) {
+        Some((now, before)) => section.replace(now, before),
+        None => section.to_owned(),
+    }
 }
 
 /// Expands a section into data sets, one for each number of views.
@@ -251,7 +253,7 @@ pub(super) fn phantoms(
         degradations.check(angles.training.len(), Layout::Native).map_err(|e| e.to_string())?;
         let stated = PhantomSection { views: Some(vec![views]), ..section.clone() };
         let mut fingerprint = files;
-        fingerprint.bytes(as_before(serde_json::to_string(&stated).map_err(|e| e.to_string())?).as_bytes());
+        fingerprint.bytes(as_before(&serde_json::to_string(&stated).map_err(|e| e.to_string())?).as_bytes());
         let options = PhantomOptions {
             setting: section.geometry.unwrap_or(Setting::SmallXcat),
             size: section.size.unwrap_or(USUAL_SIZE),

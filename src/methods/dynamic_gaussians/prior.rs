@@ -11,7 +11,7 @@ use std::collections::HashMap;
 const NEAR_MM: f64 = 3.0;
 /// Distance from which on a place is far from them, mm.
 const FAR_MM: f64 = 7.0;
-/// Largest displacement of the prior along each axis that is searched, mm.
+/// Largest displacement of the prior along each axis in the coarse steps of the search, mm; finer steps add 6 mm.
 const REACH_MM: f64 = 20.0;
 /// Steps of that search, mm: coarse ones over the whole reach, then finer ones around the best.
 const STEPS_MM: [f64; 3] = [4.0, 2.0, 1.0];
