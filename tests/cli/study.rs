@@ -135,9 +135,10 @@ fn our_studies_can_be_run() {
     let expected = [
         ("smoke", 24),
         ("table1", 198),
-        ("scaled-table1", 126),
+        ("scaled-table1", 90),
         ("table2", 30),
-        ("scaled-table2", 30),
+        ("scaled-table2", 18),
+        ("ablation", 36),
         ("time", 21),
         ("degradations", 204),
     ];
