@@ -119,7 +119,7 @@ impl FlatTree {
         let mut flat = FlatTree::default();
         for tree in &found.phases {
             let first = flat.branch_phase.len();
-            for Branch { parent, points_mm, radius_mm } in &tree.branches {
+            for Branch { parent, points_mm, radius_mm, .. } in &tree.branches {
                 flat.branch_phase.push(tree.phase);
                 flat.branch_parent.push(parent.map_or(-1, |parent| (first + parent) as i32));
                 flat.branch_first.push(flat.radius_mm.len() as u32);

@@ -52,8 +52,18 @@ pub struct Gaussians {
     /// Intensities of Gaussians of which nearer ones hide those behind them, as with X-Gaussian; none where line integrals add
     /// up.
     pub intensities: Option<Vec<f32>>,
-    /// Share of the attenuation of one fit that lies in vessels of another, where the field is the mean of several fits.
-    pub agreement: Option<f64>,
+    /// Agreement of the fits, where the field is the mean of several.
+    pub agreement: Option<FitAgreement>,
+}
+
+/// Agreement of several fits to the same images, whose mean is a field.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FitAgreement {
+    /// Share of the attenuation of one fit that lies in vessels of another, 0 to 1.
+    pub overall: f64,
+    /// For each Gaussian, the share of the other fits that have a vessel at its centre, 0 to 1, as the mean over the phases; empty where
+    /// it is not known, as in checkpoints that have only the share of all.
+    pub of_gaussians: Vec<f32>,
 }
 
 impl Gaussians {

@@ -1,7 +1,7 @@
 //! The mean of several dynamic fields that were fitted to the same images, and their agreement. Errors that the fits do not share
 //! are fainter in the mean.
 
-use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, scales, vessel_density};
+use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, FitAgreement, Gaussians, scales, vessel_density};
 use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
@@ -68,35 +68,89 @@ fn own_on_grid(set: &DeformableGaussians, index: usize, grid: &DeformableGaussia
     cosines.chain(sines).map(|v| v.extend(0.0).as_vec4().to_array()).collect()
 }
 
-/// Returns the mean, over pairs of fields and over phases, of the share of one field's attenuation that lies in vessels of the other;
-/// `None` with fewer than two fields.
-fn agreement(members: &[DynamicGaussians]) -> Option<f64> {
-    let n_phases = members.first()?.rows().n_phases;
-    let pairs: Vec<(usize, usize, usize)> = (0..members.len())
-        .flat_map(|a| (0..members.len()).filter(move |b| *b != a).map(move |b| (a, b)))
-        .flat_map(|(a, b)| (0..n_phases).map(move |phase| (a, b, phase)))
-        .collect();
-    let sums: Vec<[f64; 2]> =
-        pairs.par_iter().map(|(a, b, phase)| within(&members[*a], &members[*b], *phase)).collect();
-    let [inside, all] = sums.iter().fold([0.0; 2], |[i, a], [inside, all]| [i + inside, a + all]);
-    (all > 0.0).then(|| inside / all)
+/// A Gaussian of one fit at a phase.
+struct Found {
+    /// Number of the Gaussian in its fit.
+    index: usize,
+    /// Integral of its attenuation, without a constant factor.
+    mass: f64,
+    /// Share of the other fits that have a vessel at its centre.
+    share: f64,
 }
 
-/// Returns the attenuation of a field at a phase that lies in vessels of another, and all of it.
-fn within(field: &DynamicGaussians, other: &DynamicGaussians, phase: usize) -> [f64; 2] {
-    let (rows, of_other) = (field.at(phase), other.at(phase));
-    let (setup, other_setup) = (&field.rows().setup, &other.rows().setup);
-    let vessel = VESSEL_SHARE * vessel_density(&of_other, other_setup);
-    let shapes: Vec<Shape> = of_other.iter().map(|g| Shape::new(g, other_setup)).collect();
-    let mut sums = [0.0; 2];
-    for g in &rows {
-        let mass = f64::from(g.log_density).exp() * scales(g, setup).element_product();
-        let x = DVec3::from_array(g.position.map(f64::from));
-        let density: f64 = shapes.iter().map(|shape| shape.density(x)).sum();
-        sums[0] += if density >= vessel { mass } else { 0.0 };
-        sums[1] += mass;
+/// Returns the agreement of fits; `None` with fewer than two, and for fields without attenuation.
+fn agreement(members: &[DynamicGaussians]) -> Option<FitAgreement> {
+    let n_phases = members.first()?.rows().n_phases;
+    if members.len() < 2 {
+        return None;
     }
-    sums
+    let places: Vec<(usize, usize)> =
+        (0..members.len()).flat_map(|fit| (0..n_phases).map(move |phase| (fit, phase))).collect();
+    let found: Vec<Vec<Found>> = places.par_iter().map(|(fit, phase)| found(members, *fit, *phase)).collect();
+    let of_all = |of: fn(&Found) -> f64| found.iter().flatten().map(of).sum::<f64>();
+    let (inside, all) = (of_all(|g| g.mass * g.share), of_all(|g| g.mass));
+    let firsts: Vec<usize> = members
+        .iter()
+        .scan(0, |first, member| Some(std::mem::replace(first, *first + member.rows().rows.len())))
+        .collect();
+    let mut sums = vec![[0f32; 2]; members.iter().map(|member| member.rows().rows.len()).sum()];
+    for ((fit, _), of_phase) in places.iter().zip(&found) {
+        for g in of_phase {
+            let [sum, count] = &mut sums[firsts[*fit] + g.index];
+            *sum += g.share as f32;
+            *count += 1.0;
+        }
+    }
+    let of_gaussians = sums.into_iter().map(|[sum, count]| sum / count.max(1.0)).collect();
+    (all > 0.0).then(|| FitAgreement { overall: inside / all, of_gaussians })
+}
+
+/// Looks for the Gaussians of a fit at a phase in all other fits.
+fn found(members: &[DynamicGaussians], fit: usize, phase: usize) -> Vec<Found> {
+    let field = &members[fit];
+    let indices: Vec<usize> = match field {
+        DynamicGaussians::PerPhase(sets) => {
+            (0..sets.rows.len()).filter(|i| sets.rows[*i].phase as usize == phase).collect()
+        }
+        DynamicGaussians::Deformable(set) => (0..set.rest.rows.len()).collect(),
+    };
+    let others: Vec<(Vec<Shape>, f64)> = members
+        .iter()
+        .enumerate()
+        .filter(|(other, _)| *other != fit)
+        .map(|(_, other)| {
+            let (rows, setup) = (other.at(phase), &other.rows().setup);
+            (rows.iter().map(|g| Shape::new(g, setup)).collect(), VESSEL_SHARE * vessel_density(&rows, setup))
+        })
+        .collect();
+    let is_vessel = |x: DVec3, (shapes, vessel): &(Vec<Shape>, f64)| {
+        !shapes.is_empty() && shapes.iter().map(|shape| shape.density(x)).sum::<f64>() >= *vessel
+    };
+    let look = |(index, g): (usize, Gaussian)| {
+        let x = DVec3::from_array(g.position.map(f64::from));
+        let n = others.iter().filter(|other| is_vessel(x, other)).count();
+        let mass = f64::from(g.log_density).exp() * scales(&g, &field.rows().setup).element_product();
+        Found { index, mass, share: n as f64 / others.len() as f64 }
+    };
+    indices.into_iter().zip(field.at(phase)).map(look).collect()
+}
+
+impl DynamicGaussians {
+    /// Returns, at points in pixels, the share of the other fits that have a vessel there: the mean over the Gaussians of a phase, each
+    /// weighted by its density at the point; 0 where there is none. `None` for a single fit, and where it is not known.
+    pub fn agreement_at(&self, points: &[DVec3], phase: usize) -> Option<Vec<f64>> {
+        let rows = self.rows();
+        let shares = rows.agreement.as_ref().map(|agreement| &agreement.of_gaussians).filter(|all| !all.is_empty())?;
+        let is_shown = |i: &usize| self.deformable().is_some() || rows.rows[*i].phase as usize == phase;
+        let shares: Vec<f64> = (0..rows.rows.len()).filter(is_shown).map(|i| f64::from(shares[i])).collect();
+        let shapes: Vec<Shape> = self.at(phase).iter().map(|g| Shape::new(g, &rows.setup)).collect();
+        let at = |point: &DVec3| {
+            let densities = shapes.iter().map(|shape| shape.density(*point));
+            let (sum, all) = densities.zip(&shares).fold((0.0, 0.0), |(sum, all), (d, s)| (sum + d * s, all + d));
+            if all > 0.0 { sum / all } else { 0.0 }
+        };
+        Some(points.par_iter().map(at).collect())
+    }
 }
 
 /// A Gaussian, prepared for its density at many points.
@@ -218,15 +272,33 @@ mod tests {
     fn fields_agree_where_both_have_vessels() {
         let one = set(1, 4, 2, 0);
         let twice = DynamicGaussians::mean(&[one.clone(), one.clone()], 1.0).unwrap();
-        assert_eq!(twice.rows().agreement, Some(1.0));
+        let overall = |field: &DynamicGaussians| field.rows().agreement.as_ref().map(|agreement| agreement.overall);
+        assert_eq!(overall(&twice), Some(1.0));
         let away = |field: &DynamicGaussians, n: usize| {
             let DynamicGaussians::Deformable(mut set) = field.clone() else { unreachable!() };
             set.rest.rows.iter_mut().take(n).for_each(|g| g.position[0] += 200.0);
             DynamicGaussians::Deformable(set)
         };
-        let agreement = |n: usize| DynamicGaussians::mean(&[one.clone(), away(&one, n)], 1.0).unwrap().rows().agreement;
-        assert_eq!((agreement(4), agreement(1)), (Some(0.0), Some(0.75)));
-        assert_eq!(DynamicGaussians::mean(&[one], 1.0).unwrap().rows().agreement, None);
+        let mean = |n: usize| DynamicGaussians::mean(&[one.clone(), away(&one, n)], 1.0).unwrap();
+        assert_eq!((overall(&mean(4)), overall(&mean(1))), (Some(0.0), Some(0.75)));
+        assert_eq!(overall(&DynamicGaussians::mean(&[one], 1.0).unwrap()), None);
+    }
+
+    #[test]
+    fn a_place_has_the_share_of_the_other_fits_that_have_a_vessel_there() {
+        let one = set(1, 4, 2, 0);
+        let DynamicGaussians::Deformable(mut elsewhere) = one.clone() else { unreachable!() };
+        // The first Gaussian of the third fit lies where no other fit has a vessel.
+        elsewhere.rest.rows[0].position[0] += 200.0;
+        let members = [one.clone(), one.clone(), DynamicGaussians::Deformable(elsewhere)];
+        let mean = DynamicGaussians::mean(&members, 1.0).unwrap();
+        let of_gaussians = &mean.rows().agreement.as_ref().unwrap().of_gaussians;
+        assert_eq!(of_gaussians[..], [0.5, 1.0, 1.0, 1.0, 0.5, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 1.0]);
+        let centre = |i: usize| DVec3::from_array(mean.at(2)[i].position.map(f64::from));
+        let at = mean.agreement_at(&[centre(0), centre(1), centre(8), DVec3::splat(1e3)], 2).unwrap();
+        let wanted = [0.5, 1.0, 0.0, 0.0];
+        assert!(at.iter().zip(wanted).all(|(got, want)| (got - want).abs() < 1e-6), "{at:?}");
+        assert_eq!(one.agreement_at(&[DVec3::ZERO], 0), None, "a single fit");
     }
 
     #[test]

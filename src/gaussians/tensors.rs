@@ -1,7 +1,7 @@
 //! Gaussians in a checkpoint: tensors under documented names, and their section of the header.
 
 use crate::error::{Error, Result};
-use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, Units, inverse_step};
+use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, FitAgreement, Gaussians, Units, inverse_step};
 use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
 use crate::tensors::{File, FileTensor};
 use safetensors::tensor::Dtype;
@@ -46,6 +46,9 @@ pub(crate) struct GaussianHeader {
     /// Share of the attenuation of one fit that lies in vessels of another; none for a single fit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     agreement: Option<f64>,
+    /// Whether each Gaussian has the share of the other fits that have a vessel at its centre.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    agreements: bool,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -66,6 +69,8 @@ struct GridHeader {
 
 /// Name of the tensor of blended Gaussians' intensities.
 const INTENSITY: &str = "gaussians.intensity";
+/// Name of the tensor of agreements of fits.
+const AGREEMENT: &str = "gaussians.agreement";
 /// Name of the tensor of fillings.
 const FILLING: &str = "gaussians.filling";
 
@@ -81,7 +86,8 @@ pub(crate) fn header(field: &DynamicGaussians) -> GaussianHeader {
         views: sets.setup.n_views,
         crowd: sets.is_crowd,
         blended: sets.intensities.is_some(),
-        agreement: sets.agreement,
+        agreement: sets.agreement.as_ref().map(|agreement| agreement.overall),
+        agreements: sets.agreement.as_ref().is_some_and(|agreement| !agreement.of_gaussians.is_empty()),
         grid: match field {
             DynamicGaussians::PerPhase(_) => None,
             DynamicGaussians::Deformable(deformable) => Some(GridHeader {
@@ -111,6 +117,10 @@ pub(crate) fn tensors(field: &DynamicGaussians) -> Vec<FileTensor> {
     if let Some(intensities) = &field.rows().intensities {
         let bytes = intensities.iter().flat_map(|v| v.to_le_bytes()).collect();
         all.push((INTENSITY.into(), Dtype::F32, vec![rows.len()], bytes));
+    }
+    if let Some(agreement) = field.rows().agreement.as_ref().filter(|agreement| !agreement.of_gaussians.is_empty()) {
+        let bytes = agreement.of_gaussians.iter().flat_map(|v| v.to_le_bytes()).collect();
+        all.push((AGREEMENT.into(), Dtype::F32, vec![rows.len()], bytes));
     }
     match field {
         DynamicGaussians::PerPhase(_) => {
@@ -149,6 +159,13 @@ pub(crate) fn read_section(sections: &serde_json::Value, file: &File<'_>, n_phas
     let header: GaussianHeader = serde_json::from_value(sections[SECTION].clone())
         .map_err(|e| Error::data(file.path, SECTION, e.to_string()))?;
     read(&header, file, n_phases)
+}
+
+/// Reads the agreement of the fits whose mean a field of `n` Gaussians is; none for a single fit.
+fn agreement(header: &GaussianHeader, file: &File<'_>, n: usize) -> Result<Option<FitAgreement>> {
+    let Some(overall) = header.agreement else { return Ok(None) };
+    let of_gaussians = if header.agreements { file.floats(AGREEMENT, &[Some(n)])? } else { Vec::new() };
+    Ok(Some(FitAgreement { overall, of_gaussians }))
 }
 
 /// Reads the Gaussians that [`header`] and [`tensors`] describe.
@@ -198,7 +215,7 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
         step: header.step,
         is_crowd: header.crowd,
         intensities: header.blended.then(|| file.floats(INTENSITY, &[Some(n)])).transpose()?,
-        agreement: header.agreement,
+        agreement: agreement(header, file, n)?,
     };
     let Some(grid) = &header.grid else { return Ok(DynamicGaussians::PerPhase(sets)) };
     if !(2..=MAX_NODES).contains(&grid.nodes)

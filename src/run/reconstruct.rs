@@ -285,7 +285,8 @@ impl<'a> Loop<'a> {
         let (step, elapsed_s) = (self.training.trainer().step(), self.training.elapsed_s());
         (self.tell)(Event::Profile { step, passes: self.training.trainer_mut().profile_step()? })?;
         let (train_s, dynamic_share) = (self.training.train_s(), self.dynamic_share);
-        let agreement = self.training.trainer().outline().gaussians.and_then(|field| field.rows().agreement);
+        let agreement = self.training.trainer().outline().gaussians;
+        let agreement = agreement.and_then(|field| field.rows().agreement.as_ref().map(|fits| fits.overall));
         (self.tell)(Event::Finished { agreement, step, train_s, elapsed_s, dynamic_share })
     }
 

@@ -309,7 +309,8 @@ mod tests {
 
     fn beat(reference_phase: Option<u32>) -> BeatTree {
         let line = |phase: u32| (0..3).map(|i| DVec3::new(f64::from(i), f64::from(phase * phase), 0.0)).collect();
-        let branch = |phase| Branch { parent: None, points_mm: line(phase), radius_mm: vec![1.0; 3] };
+        let branch =
+            |phase| Branch { parent: None, points_mm: line(phase), radius_mm: vec![1.0; 3], agreement: Vec::new() };
         let phases = (0..4).map(|phase| PhaseTree { phase, branches: vec![branch(phase)] }).collect();
         BeatTree { reference_phase, threshold_per_mm: 0.1, resolution_mm: 1.0, spacing_mm: 1.0, phases }
     }

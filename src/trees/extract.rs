@@ -3,7 +3,7 @@
 use crate::error::{Error, Result};
 use crate::export::volumes::grid_over;
 use crate::gaussians::field::DynamicGaussians;
-use crate::geometry::MM_PER_UNIT;
+use crate::geometry::{MM_PER_UNIT, world_from_lps_mm};
 use crate::model::Model;
 use crate::model::component::Component;
 use crate::render::grid::PatientGrid;
@@ -172,7 +172,7 @@ impl Finder<'_> {
         if lines.is_empty() {
             return Err(self.no_vessels(phase));
         }
-        Ok(PhaseTree { phase, branches: self.measured(&field, lines) })
+        Ok(PhaseTree { phase, branches: self.measured(&field, lines, phase) })
     }
 
     /// Moves the tree of the reference phase to another phase. A material point keeps its radius.
@@ -196,13 +196,22 @@ impl Finder<'_> {
         Ok(PhaseTree { phase, branches })
     }
 
-    /// Measures the radii of the vessels along lines.
-    fn measured(&self, field: &SampledField, lines: Vec<Line>) -> Vec<Branch> {
+    /// Returns the share of the other fits that have a vessel at each point; empty for a single fit.
+    fn agreement(&self, points_mm: &[DVec3], phase: u32) -> Vec<f64> {
+        let Some(gaussians) = &self.model.gaussians else { return Vec::new() };
+        let pixel = gaussians.rows().units.pixel;
+        let points: Vec<DVec3> = points_mm.iter().map(|point| world_from_lps_mm(*point) / pixel).collect();
+        gaussians.agreement_at(&points, phase as usize).unwrap_or_default()
+    }
+
+    /// Measures the radii of the vessels along lines at a phase, and how far repeated fits agree on them.
+    fn measured(&self, field: &SampledField, lines: Vec<Line>, phase: u32) -> Vec<Branch> {
         let vessel_per_mm = self.model.vessel_attenuation.map(|attenuation| attenuation / MM_PER_UNIT);
         let lumen = Lumen { field, resolution_mm: self.resolution_mm, vessel_per_mm };
         let branch = |Line { parent, points_mm }: Line| {
             let radius_mm = lumen.radii_mm(&points_mm);
-            Branch { parent, points_mm, radius_mm }
+            let agreement = self.agreement(&points_mm, phase);
+            Branch { parent, points_mm, radius_mm, agreement }
         };
         lines.into_iter().map(branch).collect()
     }

@@ -70,6 +70,8 @@ struct BranchRow {
     length_mm: f64,
     points_mm: Vec<[f64; 3]>,
     radius_mm: Vec<f64>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    agreement: Vec<f64>,
 }
 
 fn rounded(mm: f64) -> f64 {
@@ -87,6 +89,7 @@ impl BranchRow {
             length_mm: rounded(branch.length_mm()),
             points_mm: branch.points_mm.iter().map(rounded_point).collect(),
             radius_mm: branch.radius_mm.iter().copied().map(rounded).collect(),
+            agreement: branch.agreement.iter().copied().map(rounded).collect(),
         }
     }
 }
@@ -189,17 +192,22 @@ fn title(beat: &BeatTree, tree: &PhaseTree) -> String {
 fn to_vtp(beat: &BeatTree, tree: &PhaseTree) -> String {
     let branches = || tree.branches.iter();
     let radii: Vec<f64> = branches().flat_map(|b| b.radius_mm.iter().copied().map(rounded)).collect();
+    let mut of_points = vec![
+        Values::Float("Radius", radii.clone()),
+        // VMTK and its 3D Slicer extension expect this name.
+        Values::Float("MaximumInscribedSphereRadius", radii),
+        Values::Int("PointId", branches().flat_map(|b| 0..b.points_mm.len() as i64).collect()),
+    ];
+    if branches().all(|b| b.agreement.len() == b.points_mm.len()) {
+        let agreement = branches().flat_map(|b| b.agreement.iter().copied().map(rounded)).collect();
+        of_points.push(Values::Float("Agreement", agreement));
+    }
     let lines = vtp::Lines {
         title: title(beat, tree),
         time: f64::from(tree.phase),
         points: branches().flat_map(|b| b.points_mm.iter().map(rounded_point)).collect(),
         counts: branches().map(|b| b.points_mm.len()).collect(),
-        of_points: vec![
-            Values::Float("Radius", radii.clone()),
-            // VMTK and its 3D Slicer extension expect this name.
-            Values::Float("MaximumInscribedSphereRadius", radii),
-            Values::Int("PointId", branches().flat_map(|b| 0..b.points_mm.len() as i64).collect()),
-        ],
+        of_points,
         of_lines: vec![
             Values::Int("BranchId", (0..tree.branches.len() as i64).collect()),
             Values::Int("ParentId", branches().map(|b| b.parent.map_or(-1, |parent| parent as i64)).collect()),
@@ -239,9 +247,14 @@ mod tests {
     fn beat(reference_phase: Option<u32>) -> BeatTree {
         let line = |points: &[f64]| points.iter().map(|x| DVec3::new(*x, 0.0, 1.0)).collect();
         let branches = vec![
-            Branch { parent: None, points_mm: line(&[0.0, 1.0]), radius_mm: vec![2.0, 1.5] },
-            Branch { parent: Some(0), points_mm: line(&[1.0, 2.0, 3.0]), radius_mm: vec![1.5, 1.0, 0.5] },
-            Branch { parent: Some(0), points_mm: line(&[1.0, 5.0]), radius_mm: vec![1.5, 0.7] },
+            Branch { parent: None, points_mm: line(&[0.0, 1.0]), radius_mm: vec![2.0, 1.5], agreement: Vec::new() },
+            Branch {
+                parent: Some(0),
+                points_mm: line(&[1.0, 2.0, 3.0]),
+                radius_mm: vec![1.5, 1.0, 0.5],
+                agreement: Vec::new(),
+            },
+            Branch { parent: Some(0), points_mm: line(&[1.0, 5.0]), radius_mm: vec![1.5, 0.7], agreement: Vec::new() },
         ];
         let phases = vec![PhaseTree { phase: 3, branches }];
         BeatTree { reference_phase, threshold_per_mm: 0.02, resolution_mm: 0.5, spacing_mm: 0.25, phases }

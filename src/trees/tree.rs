@@ -2,6 +2,10 @@
 
 use glam::DVec3;
 
+/// Share of the other fits below which a place is doubtful. With two views, 50 to 90 % of the places that nearly all fits have are true,
+/// and 10 to 50 % of those that fewer than this share have (`docs/performance.md`).
+pub const DOUBTFUL: f64 = 0.75;
+
 /// A vessel between two bifurcations, or between a bifurcation and an end.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Branch {
@@ -11,6 +15,9 @@ pub struct Branch {
     pub points_mm: Vec<DVec3>,
     /// Radius of the lumen at each point, mm.
     pub radius_mm: Vec<f64>,
+    /// Share of the other fits that have a vessel at each point, 0 to 1, where the field is the mean of several fits: points with little
+    /// agreement may be false crossings. Empty for a single fit.
+    pub agreement: Vec<f64>,
 }
 
 impl Branch {
@@ -28,6 +35,12 @@ impl Branch {
         let length = self.length_mm();
         let first = self.radius_mm.first().map_or(f64::NAN, |radius| 2.0 * radius);
         if length > 0.0 { area / length } else { first }
+    }
+
+    /// Mean agreement of repeated fits at the points, 0 to 1; `None` for a single fit.
+    pub fn mean_agreement(&self) -> Option<f64> {
+        let n = self.agreement.len();
+        (n > 0).then(|| self.agreement.iter().sum::<f64>() / n as f64)
     }
 
     /// Minimum diameter of the lumen, mm.
@@ -56,6 +69,17 @@ impl PhaseTree {
         self.branches.iter().map(Branch::length_mm).sum()
     }
 
+    /// Length, mm, of the parts of which less than [`DOUBTFUL`] of the other fits have a vessel; `None` for a single fit.
+    pub fn doubtful_mm(&self) -> Option<f64> {
+        let of_branch = |branch: &Branch| {
+            let steps = branch.points_mm.windows(2).map(|pair| pair[0].distance(pair[1]));
+            let doubtful = branch.agreement.windows(2).map(|pair| 0.5 * (pair[0] + pair[1]) < DOUBTFUL);
+            steps.zip(doubtful).filter(|(_, doubtful)| *doubtful).map(|(step, _)| step).sum::<f64>()
+        };
+        let is_known = self.branches.iter().any(|branch| !branch.agreement.is_empty());
+        is_known.then(|| self.branches.iter().map(of_branch).sum())
+    }
+
     /// Number of connected trees: branches without a parent.
     pub fn components(&self) -> usize {
         self.branches.iter().filter(|branch| branch.parent.is_none()).count()
@@ -76,4 +100,25 @@ pub struct BeatTree {
     pub spacing_mm: f64,
     /// Phases, in the order of the request.
     pub phases: Vec<PhaseTree>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_that_few_fits_have_are_doubtful() {
+        let line = |agreement: &[f64]| Branch {
+            parent: None,
+            points_mm: (0..4).map(|i| DVec3::X * 2.0 * f64::from(i)).collect(),
+            radius_mm: vec![1.0; 4],
+            agreement: agreement.to_vec(),
+        };
+        let tree = |branches: Vec<Branch>| PhaseTree { phase: 0, branches };
+        let doubt = tree(vec![line(&[1.0, 1.0, 0.4, 0.0]), line(&[1.0; 4])]);
+        assert_eq!(doubt.doubtful_mm(), Some(4.0), "two of six steps of 2 mm");
+        assert_eq!(doubt.branches[0].mean_agreement(), Some(0.6));
+        let single = tree(vec![line(&[])]);
+        assert_eq!((single.doubtful_mm(), single.branches[0].mean_agreement()), (None, None));
+    }
 }

@@ -80,12 +80,33 @@ fn a_displaced_prior_resolves_the_depth_of_two_views() {
     // What a CT of another day states: displaced, and slightly larger.
     let prior = at("prior.json");
     changed(tree, &prior, false, 1.0, |[r, a, s]| [1.03 * r + 4.0, 1.03 * a - 3.0, 1.03 * s + 5.0]);
-    assert!(!notes(&at("without"), &["--stop-at", "130"]).contains("prior"));
+    let alone = notes(&at("without"), &["--stop-at", "130"]);
+    assert!(!alone.contains("prior") && alone.contains("the mean of 5 fits"), "{alone}");
     let said = notes(&at("with"), &["--stop-at", "130", "--prior", text(&prior)]);
     assert!(said.contains("the prior's vessels, moved by"), "{said}");
     let [without, with] = [found(&at("without")), found(&at("with"))];
     println!("found: {without} without a prior, {with} with one");
     assert!(with > 0.68 && with > without + 0.1, "{without} without a prior, {with} with one");
+    agreement_of_fits_is_stated(&at("without"));
+}
+
+/// Each point of a tree from two views has the share of the other fits that have a vessel there.
+fn agreement_of_fits_is_stated(run: &Path) {
+    let file = run.join("doubt.json");
+    let out = program().args(["tree", text(run), "--phase", "0", "-o", text(&file)]).output().unwrap();
+    let said = String::from_utf8_lossy(&out.stderr);
+    assert!(out.status.success() && said.contains("less than 75 % of the other fits have"), "{said}");
+    let tree: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    let branches = tree["phases"][0]["branches"].as_array().unwrap();
+    let numbers = |value: &Value| -> Vec<f64> { serde_json::from_value(value.clone()).unwrap() };
+    let shares: Vec<Vec<f64>> = branches.iter().map(|branch| numbers(&branch["agreement"])).collect();
+    for (branch, shares) in branches.iter().zip(&shares) {
+        assert_eq!(shares.len(), branch["points_mm"].as_array().unwrap().len());
+    }
+    let all: Vec<f64> = shares.concat();
+    assert!(all.iter().all(|share| (0.0..=1.0).contains(share)), "{all:?}");
+    let agreed = all.iter().filter(|share| **share > 0.9).count();
+    assert!(agreed > 0 && agreed < all.len(), "some places are doubtful, others are not: {all:?}");
 }
 
 #[test]

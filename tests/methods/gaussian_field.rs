@@ -304,9 +304,10 @@ fn the_mean_of_fits_holds_all_of_them_and_their_agreement() {
                 assert!(apart < 1e-3, "{form}, phase {phase}: {apart} pixels");
             }
         }
-        let agreement = mean.rows().agreement.unwrap();
-        println!("{form}: {agreement:.3}");
-        assert!(agreement > 0.3 && agreement < 1.0, "{agreement}");
+        let agreement = mean.rows().agreement.clone().unwrap();
+        println!("{form}: {:.3}", agreement.overall);
+        assert!(agreement.overall > 0.3 && agreement.overall < 1.0, "{}", agreement.overall);
+        assert_eq!(agreement.of_gaussians.len(), mean.rows().rows.len());
         assert_eq!(members[0].1.rows().agreement, None);
     }
     expect_silence(gpu);

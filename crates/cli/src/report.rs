@@ -182,8 +182,8 @@ fn gaussians_of(field: &DynamicGaussians) -> String {
         DynamicGaussians::Deformable(_) => "one deformable set",
     };
     let kib = field.bytes() as f64 / 1024.0;
-    let agreement = field.rows().agreement.map_or(String::new(), |share| {
-        let percent = 100.0 * share;
+    let agreement = field.rows().agreement.as_ref().map_or(String::new(), |fits| {
+        let percent = 100.0 * fits.overall;
         format!(", the mean of several fits; {percent:.0} % of the vessels of one fit lie in those of another")
     });
     let (n, name) = (field.rows().rows.len(), field.form().name());

@@ -15,7 +15,7 @@ use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::Evaluation;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
-use nertca_vk::trees::tree::BeatTree;
+use nertca_vk::trees::tree::{BeatTree, DOUBTFUL};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -144,8 +144,11 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     earlier.make_way(&made)?;
     made.iter().for_each(|path| out!("{}", path.display()));
     for tree in &beat.phases {
+        let doubt = tree.doubtful_mm().map_or(String::new(), |mm| {
+            format!("; less than {:.0} % of the other fits have {mm:.1} mm of it, which may be false", 100.0 * DOUBTFUL)
+        });
         eprintln!(
-            "phase {}: {:.1} mm in {} branches, components: {}",
+            "phase {}: {:.1} mm in {} branches, components: {}{doubt}",
             tree.phase,
             tree.length_mm(),
             tree.branches.len(),

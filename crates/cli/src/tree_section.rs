@@ -11,7 +11,7 @@ use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk::scan::gating::SYSTOLE_SHARE;
 use nertca_vk::score::pictures::Window;
 use nertca_vk::trees::files::{note, to_json};
-use nertca_vk::trees::tree::{BeatTree, PhaseTree};
+use nertca_vk::trees::tree::{BeatTree, DOUBTFUL, PhaseTree};
 use serde_json::{Value, json};
 
 const SCRIPT: &str = include_str!("report_trees.js");
@@ -113,12 +113,14 @@ fn view_data(dataset: &Dataset, view: usize, step: usize) -> Result<Value> {
 }
 
 fn table(name: &str, tree: &PhaseTree) -> Markup {
+    let is_mean = tree.doubtful_mm().is_some();
     html! {
         div {
             h3 { (name) " (phase " (tree.phase) ")" }
             table {
                 tr { th { "branch" } th { "parent" } th { "length, mm" } th { "mean diameter, mm" } th { "minimum, \
-                                                                                                          mm" } }
+                                                                                                          mm" }
+                    @if is_mean { th { "other fits, %" } } }
                 @for (index, branch) in tree.branches.iter().enumerate() {
                     tr data-branch=(index) data-phase=(tree.phase) {
                         td { i data-colour=(index) {} (index) }
@@ -126,9 +128,14 @@ fn table(name: &str, tree: &PhaseTree) -> Markup {
                         td { (format!("{:.1}", branch.length_mm())) }
                         td { (format!("{:.2}", branch.mean_diameter_mm())) }
                         td { (format!("{:.2}", branch.min_diameter_mm())) }
+                        @if is_mean { td { (branch.mean_agreement().map_or("-".into(), |share| format!("{:.0}", 100.0 * share))) } }
                     }
                 }
-                tr { td { "all" } td {} td { (format!("{:.1}", tree.length_mm())) } td {} td {} }
+                tr { td { "all" } td {} td { (format!("{:.1}", tree.length_mm())) } td {} td {} @if is_mean { td {} } }
+            }
+            @if let Some(mm) = tree.doubtful_mm() {
+                p { "The field is the mean of several fits. \"Other fits\" is the share of them that have a vessel there. Less than "
+                    (format!("{:.0}", 100.0 * DOUBTFUL)) " % of them have " (format!("{mm:.1}")) " mm of this tree, which may be false." }
             }
         }
     }

@@ -15,11 +15,17 @@ const NEXT_SEED: u32 = 1000;
 const MEAN_FACTOR: f64 = 4.0 / 3.0;
 /// Number of fits to noisy or inconsistent images. The mean of fits to good images is broader than each of them.
 const FITS: u32 = 3;
+/// Number of fits to two views, which leave alternatives: places that few fits find are often false crossings.
+const FITS_TO_TWO_VIEWS: u32 = 5;
 
 impl Targets {
     /// Returns the number of fits where `asked` leaves it open (0), and the reason for more than one.
     pub(crate) fn fits(&self, asked: u32) -> (u32, Option<&'static str>) {
         match asked {
+            0 if self.n_views == 2 => (
+                FITS_TO_TWO_VIEWS,
+                Some("because two views leave alternatives, and places that few fits find are often false"),
+            ),
             0 if self.is_noisy() => (FITS, Some("because the images are noisy")),
             // Only an adjustment of views finds contrasts of frames.
             0 if self.contrast.iter().any(|c| *c != 1.0) => (FITS, Some("because the views had to be adjusted")),
