@@ -10,7 +10,6 @@ pub mod adjustment;
 pub mod choose;
 pub mod correction;
 pub mod gauge;
-pub(crate) mod linear;
 pub mod observed;
 pub mod pose;
 pub mod profiles;

@@ -37,6 +37,7 @@
 //! #     phases: 4,
 //! #     views: nertca_vk::phantom::views::ViewAngles::published(3)?,
 //! #     seed: 1,
+//! #     stenoses: Vec::new(),
 //! #     degradations: Default::default(),
 //! #     layout: nertca_vk::scan::dataset::Layout::Native,
 //! #     anatomy: None,
@@ -81,6 +82,7 @@
 pub mod choice;
 pub mod error;
 pub mod fingerprint;
+pub(crate) mod linear;
 pub mod random;
 pub mod tensors;
 
@@ -237,6 +239,7 @@ pub mod trees {
     pub mod files;
     mod follow;
     mod graph;
+    pub mod lesions;
     mod radii;
     mod refine;
     mod sampled;
@@ -272,6 +275,7 @@ pub mod phantom {
     pub mod projector;
     mod runs;
     mod sight;
+    pub mod stenosis;
     mod subjects;
     pub mod tree;
     pub mod tree_file;

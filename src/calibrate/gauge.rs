@@ -1,9 +1,9 @@
 //! The motion that no image determines: a common motion of all views (method, robustness of geometry, section 3). The
 //! minimum corrections are chosen; where the truth is known, the motion can be found.
 
-use crate::calibrate::linear::Symmetric;
 use crate::calibrate::pose::{Poses, StatedView};
 use crate::geometry::{ViewRays, lps_mm_from_world, world_from_lps_mm};
+use crate::linear::Symmetric;
 use glam::{DAffine3, DMat3, DVec3};
 
 /// Projections of a shift onto the plane across each view's axis, and the inverse of their sum over the views.

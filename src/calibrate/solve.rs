@@ -1,9 +1,9 @@
 //! Most likely corrections, by Gauss-Newton on the difference of profiles (method, robustness of geometry, section 5).
 
-use crate::calibrate::linear::Symmetric;
 use crate::calibrate::pose::Poses;
 use crate::calibrate::profiles::{Blur, Pair, PairAtPhase, Pencil, Views};
 use crate::geometry::MM_PER_UNIT;
+use crate::linear::Symmetric;
 use glam::DVec3;
 use rayon::prelude::*;
 

@@ -11,6 +11,7 @@ use crate::phantom::noise::add_noise;
 use crate::phantom::projector::Projector;
 use crate::phantom::runs::{Shot, shots};
 use crate::phantom::sight::Sight;
+use crate::phantom::stenosis::Stenosis;
 use crate::phantom::subjects::{Build, Moving, Patient, PatientFiles, Placed, Pose, Reading, Subject, Thorax, Volumes};
 use crate::phantom::tree::Tree;
 use crate::phantom::tree_file::{TREE, TreeFile};
@@ -19,7 +20,7 @@ use crate::phantom::voxels::Tissues;
 use crate::raster::Image;
 use crate::scan::dataset::{Layout, MANIFEST, Split};
 use crate::scan::nerfca;
-use crate::scan::truth::{TrueFrame, Truth};
+use crate::scan::truth::{TrueFrame, TrueLesion, Truth};
 use crate::scan::writer::{About, Writer, authors_angles};
 use crate::score::volume::VOLUMES;
 use glam::DVec3;
@@ -63,6 +64,8 @@ pub struct PhantomOptions {
     pub seed: u32,
     /// Degradations of the images.
     pub degradations: Degradations,
+    /// Stenoses of the vessels.
+    pub stenoses: Vec<Stenosis>,
     /// Layout to write.
     pub layout: Layout,
     /// Real anatomy instead of the procedural one.
@@ -126,6 +129,8 @@ struct Stage {
     phases: u32,
     still: bool,
     subject: Box<dyn Subject>,
+    /// Stenoses of the vessels.
+    lesions: Vec<TrueLesion>,
     /// Whether the moving background already contains the vessels.
     vessels_in_background: bool,
 }
@@ -231,6 +236,7 @@ pub fn project_volumes(
         phases: total as u32,
         still: options.still,
         subject: Box::new(volumes),
+        lesions: Vec::new(),
         vessels_in_background: true,
     };
     shoot(&projector, &stage, &shooting, out, progress)?;
@@ -414,6 +420,7 @@ fn shoot(
     }
     let mut writer = Writer::new(out, shooting.layout, about)?;
     let mut truth = Truth::new(shooting.seed, stage.phases);
+    truth.lesions.clone_from(&stage.lesions);
     let mut camera = Camera::new(projector, stage, size)?;
     let mut plan = Vec::new();
     for (view, split) in splits.iter().enumerate() {
@@ -498,7 +505,7 @@ fn procedural(options: &PhantomOptions) -> Result<Stage> {
             (Build { tissues: Tissues::MAGIX, scale: 0.62, centre_mm: DVec3::ZERO, half_mm }, 2000.0, 600.0)
         }
     };
-    let thorax = Thorax::new(build, options.seed, options.phases);
+    let (thorax, lesions) = Thorax::new(build, options.seed, options.phases, &options.stenoses)?;
     let radius = build.half_mm.max_element() + build.centre_mm.x.abs().max(build.centre_mm.y.abs());
     let c_arms = CArmOptions {
         sod_mm: vec![sod_mm],
@@ -515,6 +522,7 @@ fn procedural(options: &PhantomOptions) -> Result<Stage> {
         phases: options.phases,
         still: false,
         subject: Box::new(thorax),
+        lesions,
         vessels_in_background: false,
     })
 }
@@ -531,6 +539,7 @@ fn from_files(options: &PhantomOptions, anatomy: &Anatomy) -> Result<(Stage, Vec
         background: anatomy.background.as_deref(),
         centre: anatomy.centre,
         vessel_per_mm,
+        stenoses: &options.stenoses,
     };
     let (patient, warnings) = Patient::read(&files, options.phases, &sight)?;
     let radius = patient.axial_radius_mm().unwrap_or_else(|| widest_field_mm(&c_arms, options.size));
@@ -541,6 +550,7 @@ fn from_files(options: &PhantomOptions, anatomy: &Anatomy) -> Result<(Stage, Vec
         vessel_attenuation: Some(vessel_per_mm),
         phases: options.phases,
         still: false,
+        lesions: patient.lesions(),
         subject: Box::new(patient),
         vessels_in_background: false,
     };

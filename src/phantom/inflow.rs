@@ -28,7 +28,7 @@ impl Tree {
 
     /// Path length along the vessels from the nearest root to each point of each branch, mm. Roots are the first points of
     /// branches that do not leave another branch; in a ring of branches, the first point of the branch listed first.
-    fn ways_mm(&self) -> Vec<Vec<f64>> {
+    pub(super) fn ways_mm(&self) -> Vec<Vec<f64>> {
         let along_mm: Vec<Vec<f64>> = self.branches.iter().map(Branch::along_mm).collect();
         let joints: Vec<Vec<Joint>> = (0..self.branches.len()).map(|branch| self.joints(branch, &along_mm)).collect();
         let mut starts_mm: Vec<f64> =

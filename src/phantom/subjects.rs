@@ -7,10 +7,12 @@ use crate::formats::volume_files;
 use crate::phantom::catheter;
 use crate::phantom::projector::{LoadedVolume, Projector};
 use crate::phantom::sight::{Seen, Sight, check_lengths, check_spacing};
+use crate::phantom::stenosis::{Narrowing, Stenosis};
 use crate::phantom::tree::{Bounds, Heart, Tree};
 use crate::phantom::tree_file::TreeFile;
 use crate::phantom::voxels::{self, Breath, Tissues};
 use crate::scan::gating::contraction;
+use crate::scan::truth::TrueLesion;
 use crate::score::volume::truth_file;
 use glam::DVec3;
 use std::path::{Path, PathBuf};
@@ -105,11 +107,20 @@ pub(super) struct Thorax {
     heart: Heart,
     bounds: Bounds,
     still: Volume,
+    narrowing: Narrowing,
 }
 
 impl Thorax {
-    /// Makes a thorax, with the middle of its tree at the isocentre, as on a real table.
-    pub(super) fn new(build: Build, seed: u32, phases: u32) -> Thorax {
+    /// Makes a thorax, with the middle of its tree at the isocentre, as on a real table. Returns its lesions as well.
+    ///
+    /// # Errors
+    /// Errors of [`Narrowing::new`].
+    pub(super) fn new(
+        build: Build,
+        seed: u32,
+        phases: u32,
+        stenoses: &[Stenosis],
+    ) -> Result<(Thorax, Vec<TrueLesion>)> {
         let scale = build.scale;
         let heart = Heart::new(DVec3::ZERO, scale);
         let bounds = Bounds::over_the_beat(phases, |fraction| Tree::procedural(&heart, scale, fraction, seed));
@@ -117,11 +128,12 @@ impl Thorax {
         let heart = Heart::new(heart_mm, scale);
         let bounds = Bounds::over_the_beat(phases, |fraction| Tree::procedural(&heart, scale, fraction, seed));
         let still = voxels::thorax(build.tissues, heart_mm, scale, build.centre_mm, build.half_mm);
-        Thorax { build, seed, heart_mm, heart, bounds, still }
+        let (narrowing, lesions) = Narrowing::new(&Tree::procedural(&heart, scale, 0.0, seed), stenoses)?;
+        Ok((Thorax { build, seed, heart_mm, heart, bounds, still, narrowing }, lesions))
     }
 
     fn tree(&self, fraction: f64) -> Tree {
-        Tree::procedural(&self.heart, self.build.scale, fraction, self.seed)
+        self.narrowing.applied(Tree::procedural(&self.heart, self.build.scale, fraction, self.seed))
     }
 
     fn vessels(&self, tree: &Tree) -> Volume {
@@ -187,6 +199,7 @@ pub(super) struct PatientFiles<'a> {
     /// Whether the middle of the tree is put at the isocentre.
     pub(super) centre: bool,
     pub(super) vessel_per_mm: f64,
+    pub(super) stenoses: &'a [Stenosis],
 }
 
 /// A tree from a file, with a CT as its background if there is one.
@@ -195,6 +208,8 @@ pub(super) struct Patient {
     bounds: Bounds,
     vessel_per_mm: f64,
     still: Option<Volume>,
+    narrowing: Narrowing,
+    lesions: Vec<TrueLesion>,
 }
 
 impl Patient {
@@ -213,7 +228,8 @@ impl Patient {
         vessels.check(files.tree, "the vessels")?;
         let bounds = Bounds::over_the_beat(phases, |fraction| tree.at(fraction));
         let still = files.background.map(|path| Self::background(path, shift_mm, sight)).transpose()?;
-        let patient = Patient { tree, bounds, vessel_per_mm: files.vessel_per_mm, still };
+        let (narrowing, lesions) = Narrowing::new(&tree.at(0.0), files.stenoses)?;
+        let patient = Patient { tree, bounds, vessel_per_mm: files.vessel_per_mm, still, narrowing, lesions };
         Ok((patient, vessels.missing("the vessels").into_iter().collect()))
     }
 
@@ -227,6 +243,16 @@ impl Patient {
         seen.add_volume(&volume);
         seen.check(path, "the voxels of the CT")?;
         Ok(volume)
+    }
+
+    /// Returns the vessels at a fraction of the beat.
+    fn tree(&self, fraction: f64) -> Tree {
+        self.narrowing.applied(self.tree.at(fraction))
+    }
+
+    /// Returns the stenoses of the vessels.
+    pub(super) fn lesions(&self) -> Vec<TrueLesion> {
+        self.lesions.clone()
     }
 
     /// Largest axial distance of the CT's corners from the isocentre, mm; none without a CT.
@@ -245,9 +271,9 @@ impl Subject for Patient {
     }
 
     fn moving(&self, projector: &Projector, pose: &Pose) -> Result<Moving> {
-        let tree = self.tree.at(pose.fraction);
+        let tree = self.tree(pose.fraction);
         let catheter = pose
-            .catheter_between(&self.tree.at(0.0), &tree)
+            .catheter_between(&self.tree(0.0), &tree)
             .map(|[rest, tip]| catheter::volume(tip, rest, 1.0, self.vessel_per_mm, VESSEL_VOXEL_MM));
         Ok(Moving {
             background: None,
@@ -260,11 +286,11 @@ impl Subject for Patient {
     }
 
     fn vessel_tree(&self, fraction: f64) -> Option<Tree> {
-        Some(self.tree.at(fraction))
+        Some(self.tree(fraction))
     }
 
     fn write_volumes(&self, directory: &Path, phase: u32, fraction: f64) -> Result<()> {
-        write_vessels(directory, phase, &self.vessels(&self.tree.at(fraction)))
+        write_vessels(directory, phase, &self.vessels(&self.tree(fraction)))
     }
 }
 

@@ -10,7 +10,7 @@ use crate::scan::gating::contraction;
 use glam::DVec3;
 
 /// A vessel as a polyline.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Branch {
     /// Anatomical name.
     pub name: String,

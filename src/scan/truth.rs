@@ -25,8 +25,31 @@ pub struct Truth {
     pub seed: u32,
     /// Number of cardiac phases T.
     pub phases: u32,
+    /// Stenoses of the vessels; empty in most datasets.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub lesions: Vec<TrueLesion>,
     /// One entry per image, in the order of the dataset.
     pub frames: Vec<TrueFrame>,
+}
+
+/// A true stenosis, at rest (phase 0).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrueLesion {
+    /// Name of the branch.
+    pub branch: String,
+    /// Position of the least diameter, mm along the branch from its first point.
+    pub position_mm: f64,
+    /// Position of the least diameter, mm along the vessels from the ostium.
+    pub from_ostium_mm: f64,
+    /// Length along the branch, mm.
+    pub length_mm: f64,
+    /// Diameter of the vessel there without the stenosis, mm.
+    pub reference_diameter_mm: f64,
+    /// Least diameter, mm.
+    pub min_diameter_mm: f64,
+    /// Diameter stenosis, percent.
+    pub percent: f64,
 }
 
 /// True acquisition of one image.
@@ -67,7 +90,7 @@ fn everywhere() -> f64 {
 impl Truth {
     /// Makes the truth of a dataset with `phases` phases and no frames.
     pub fn new(seed: u32, phases: u32) -> Truth {
-        Truth { format: FORMAT.to_owned(), version: VERSION, seed, phases, frames: Vec::new() }
+        Truth { format: FORMAT.to_owned(), version: VERSION, seed, phases, lesions: Vec::new(), frames: Vec::new() }
     }
 
     /// Reads the truth of the dataset in a directory.

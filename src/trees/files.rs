@@ -4,6 +4,7 @@ use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::swc;
 use crate::formats::vtp::{self, Values};
+use crate::trees::lesions::{Lesion, lesions};
 use crate::trees::tree::{BeatTree, Branch, PhaseTree};
 use crate::trees::tubes::to_glb;
 use glam::DVec3;
@@ -62,6 +63,32 @@ struct PhaseRow {
     phase: u32,
     length_mm: f64,
     branches: Vec<BranchRow>,
+    lesions: Vec<LesionRow>,
+}
+
+#[derive(Serialize)]
+struct LesionRow {
+    branch: usize,
+    point: usize,
+    from_root_mm: f64,
+    length_mm: f64,
+    min_diameter_mm: f64,
+    reference_diameter_mm: f64,
+    stenosis_percent: f64,
+}
+
+impl LesionRow {
+    fn of(lesion: Lesion) -> LesionRow {
+        LesionRow {
+            stenosis_percent: (10.0 * lesion.percent()).round() / 10.0,
+            branch: lesion.branch,
+            point: lesion.point,
+            from_root_mm: rounded(lesion.from_root_mm),
+            length_mm: rounded(lesion.length_mm),
+            min_diameter_mm: rounded(lesion.min_diameter_mm),
+            reference_diameter_mm: rounded(lesion.reference_diameter_mm),
+        }
+    }
 }
 
 #[derive(Serialize)]
@@ -169,6 +196,7 @@ pub fn to_json(beat: &BeatTree) -> Result<String> {
         phase: tree.phase,
         length_mm: rounded(tree.length_mm()),
         branches: tree.branches.iter().map(BranchRow::of).collect(),
+        lesions: lesions(tree, beat.resolution_mm).into_iter().map(LesionRow::of).collect(),
     });
     let file = TreeFile {
         format: FORMAT,

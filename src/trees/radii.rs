@@ -20,7 +20,7 @@ const RISE: f64 = 1.02;
 /// Share of the peak below which a profile may end in a valley.
 const FALLEN: f64 = 0.8;
 /// Half length of the median filter of radii along a line, in units of the field's resolution.
-const MEDIAN: f64 = 1.5;
+const MEDIAN: f64 = 0.5;
 
 /// Result of a profile in one direction.
 struct Flank {

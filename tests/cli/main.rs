@@ -39,6 +39,7 @@ mod positions;
 mod prior;
 mod run_directories;
 mod selftest;
+mod stenosis;
 mod study;
 mod tree_files;
 mod tree_pages;

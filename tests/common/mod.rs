@@ -88,6 +88,7 @@ pub fn phantom(gpu: &Gpu, directory: &Path, size: usize, views: u32) -> Dataset 
         phases: 10,
         views: ViewAngles::published(views).unwrap(),
         seed: 1,
+        stenoses: Vec::new(),
         degradations: Degradations::default(),
         layout: Layout::Native,
         anatomy: None,

@@ -224,6 +224,7 @@ fn phantom_of_six_phases() -> Dataset {
         phases: 6,
         views: ViewAngles::published(4).unwrap(),
         seed: 1,
+        stenoses: Vec::new(),
         degradations: Degradations::default(),
         layout: Layout::Native,
         anatomy: None,

@@ -88,6 +88,7 @@ fn options(degradations: Degradations, anatomy: Option<Anatomy>) -> PhantomOptio
         phases: PHASES,
         views: views(),
         seed: 5,
+        stenoses: Vec::new(),
         degradations,
         layout: Layout::Native,
         anatomy,

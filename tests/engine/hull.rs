@@ -42,6 +42,7 @@ fn phantom(gpu: &Gpu, views: u32) -> Phantom {
         phases: PHASES,
         views: ViewAngles::published(views).unwrap(),
         seed: 1,
+        stenoses: Vec::new(),
         degradations: Degradations::default(),
         layout: Layout::Native,
         anatomy: None,

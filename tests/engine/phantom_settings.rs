@@ -29,6 +29,7 @@ fn made(setting: Setting) -> Made {
         phases: 3,
         views: ViewAngles::published(4).unwrap(),
         seed: 1,
+        stenoses: Vec::new(),
         degradations: Degradations::default(),
         layout: Layout::Native,
         anatomy: None,

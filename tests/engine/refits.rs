@@ -31,6 +31,7 @@ fn phantom(gpu: &Gpu) -> (tempfile::TempDir, Dataset) {
         phases: PHASES,
         views: ViewAngles::published(4).unwrap(),
         seed: 1,
+        stenoses: Vec::new(),
         degradations: Degradations::default(),
         layout: Layout::Native,
         volumes_every: None,

@@ -169,6 +169,7 @@ fn default_phantom(gpu: &Gpu, scratch: &Path) -> Result<Dataset> {
         phases: 10,
         views: ViewAngles::published(4)?,
         seed: 1,
+        stenoses: Vec::new(),
         degradations: Degradations::default(),
         layout: Layout::Native,
         anatomy: None,

@@ -88,6 +88,7 @@ pub fn phantom(global: &GlobalOptions, args: &PhantomArgs) -> Result<()> {
         views: args.views.views()?,
         seed: args.seed,
         degradations: args.degradations.degradations(args.catheter),
+        stenoses: args.stenosis.clone(),
         layout: args.layout,
         anatomy: args.tree.as_ref().map(|tree| Anatomy {
             tree: tree.clone(),

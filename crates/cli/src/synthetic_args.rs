@@ -8,6 +8,7 @@ use nertca_vk::phantom::dataset::Setting;
 use nertca_vk::phantom::degradations::{Breathing, Degradations, GeometryError, Rhythm};
 use nertca_vk::phantom::degradations::{USUAL_BEATS, USUAL_BREATH_S, USUAL_FRAMES_PER_S};
 use nertca_vk::phantom::noise::Photons;
+use nertca_vk::phantom::stenosis::Stenosis;
 use nertca_vk::phantom::views::{Angles, CArmOptions, PixelPitch, ViewAngles};
 use nertca_vk::scan::dataset::Layout;
 use nertca_vk::scan::gating::BeatScaling;
@@ -67,6 +68,11 @@ pub struct PhantomArgs {
     /// end does not move; it is not part of the masks.
     #[arg(long, help_heading = DEGRADATIONS)]
     pub catheter: bool,
+    /// Narrow a vessel: its branch by the name that the tree has (LM, LAD, LCx, D1 and so on in the procedural one), the position of
+    /// the least diameter, mm along the branch, the narrowing of the diameter, percent, and the length, mm. May be given several
+    /// times; `truth.json` has the lesions.
+    #[arg(long, value_name = "BRANCH,POSITION,DIAMETER%,LENGTH", value_parser = stenosis)]
+    pub stenosis: Vec<Stenosis>,
     /// Degradations that occur in a cath lab.
     #[command(flatten)]
     pub degradations: DegradationArgs,
@@ -278,6 +284,18 @@ impl CArmArgs {
 fn geometry_error(text: &str) -> std::result::Result<GeometryError, String> {
     let [angle_deg, position_mm] = pair(text).ok_or("degrees and mm are needed, written as DEG,MM")?;
     Ok(GeometryError { angle_deg, position_mm })
+}
+
+/// Parses `BRANCH,POSITION,DIAMETER%,LENGTH`; the name of the branch may contain commas.
+fn stenosis(text: &str) -> std::result::Result<Stenosis, String> {
+    let problem = "a branch, a position in mm, a narrowing in percent and a length in mm are needed, written as \
+                   BRANCH,POSITION,DIAMETER%,LENGTH, such as LAD,20,60,8";
+    let mut parts = text.rsplitn(4, ',');
+    let mut number = || parts.next()?.trim().trim_end_matches('%').parse().ok();
+    let numbers = number().zip(number()).zip(number());
+    let ((length_mm, percent), position_mm) = numbers.ok_or(problem)?;
+    let branch = parts.next().ok_or(problem)?.trim().to_owned();
+    Ok(Stenosis { branch, position_mm, percent, length_mm })
 }
 
 /// Parses `MM` or `MM,PERIOD_S`.

@@ -15,6 +15,7 @@ use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::Evaluation;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
+use nertca_vk::trees::lesions::{Lesion, lesions};
 use nertca_vk::trees::tree::{BeatTree, DOUBTFUL};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -128,6 +129,19 @@ fn find(
     })
 }
 
+/// Describes a lesion in a line.
+fn in_words(lesion: &Lesion) -> String {
+    format!(
+        "stenosis of {:.0} % in branch {}, {:.1} mm from the root: {:.2} mm instead of {:.2} mm, over {:.1} mm",
+        lesion.percent(),
+        lesion.branch,
+        lesion.from_root_mm,
+        lesion.min_diameter_mm,
+        lesion.reference_diameter_mm,
+        lesion.length_mm
+    )
+}
+
 /// Finds the vessels of a run as trees and writes them.
 pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     let unknown = || Error::config("--out", args.out.display(), "does not end in one of .json .vtp .swc .glb");
@@ -154,6 +168,13 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
             tree.branches.len(),
             tree.components()
         );
+    }
+    // Followed points keep their radii, so that all phases have the same lesions.
+    let with_lesions = if beat.reference_phase.is_some() { 1 } else { beat.phases.len() };
+    for tree in beat.phases.iter().take(with_lesions) {
+        for lesion in lesions(tree, beat.resolution_mm) {
+            eprintln!("phase {}: {}", tree.phase, in_words(&lesion));
+        }
     }
     eprintln!(
         "a point is vessel above {:.4e} per mm; the resolution of the field is {:.2} mm, and it was sampled every \

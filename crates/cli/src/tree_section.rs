@@ -11,6 +11,7 @@ use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk::scan::gating::SYSTOLE_SHARE;
 use nertca_vk::score::pictures::Window;
 use nertca_vk::trees::files::{note, to_json};
+use nertca_vk::trees::lesions::{Lesion, MIN_PERCENT, lesions};
 use nertca_vk::trees::tree::{BeatTree, DOUBTFUL, PhaseTree};
 use serde_json::{Value, json};
 
@@ -30,6 +31,8 @@ pub struct TreeSection {
     note: &'static str,
     /// Names of the phases with tables, and their trees.
     tables: Vec<(&'static str, PhaseTree)>,
+    /// Resolution of the field, mm.
+    resolution_mm: f64,
 }
 
 impl TreeSection {
@@ -51,6 +54,7 @@ impl TreeSection {
             data: format!(r#"{{"tree":{},"views":{views}}}"#, to_json(beat)?),
             note: note(beat),
             tables: names.into_iter().filter_map(named).collect(),
+            resolution_mm: beat.resolution_mm,
         })
     }
 
@@ -69,7 +73,7 @@ impl TreeSection {
             }
             p #tree-told role="status" {}
             div.by-view #tree-views {}
-            div.by-view { @for (name, tree) in &self.tables { (table(name, tree)) } }
+            div.by-view { @for (name, tree) in &self.tables { (table(name, tree, self.resolution_mm)) } }
             // The data contain only numbers, angles and base64 images, so that nothing in them can close the element.
             script #tree-data type="application/json" { (PreEscaped(&self.data)) }
             script { (PreEscaped(TREES_SCRIPT)) (PreEscaped(SCRIPT)) }
@@ -112,7 +116,7 @@ fn view_data(dataset: &Dataset, view: usize, step: usize) -> Result<Value> {
     }))
 }
 
-fn table(name: &str, tree: &PhaseTree) -> Markup {
+fn table(name: &str, tree: &PhaseTree, resolution_mm: f64) -> Markup {
     let is_mean = tree.doubtful_mm().is_some();
     html! {
         div {
@@ -133,9 +137,33 @@ fn table(name: &str, tree: &PhaseTree) -> Markup {
                 }
                 tr { td { "all" } td {} td { (format!("{:.1}", tree.length_mm())) } td {} td {} @if is_mean { td {} } }
             }
+            (lesion_table(&lesions(tree, resolution_mm)))
             @if let Some(mm) = tree.doubtful_mm() {
                 p { "The field is the mean of several fits. \"Other fits\" is the share of them that have a vessel there. Less than "
                     (format!("{:.0}", 100.0 * DOUBTFUL)) " % of them have " (format!("{mm:.1}")) " mm of this tree, which may be false." }
+            }
+        }
+    }
+}
+
+/// Renders the stenoses of a tree; says so where there is none.
+fn lesion_table(lesions: &[Lesion]) -> Markup {
+    if lesions.is_empty() {
+        return html! { p { "No stenosis of " (format!("{MIN_PERCENT:.0}")) " % or more was found." } };
+    }
+    html! {
+        table {
+            tr { th { "stenosis, %" } th { "branch" } th { "from the root, mm" } th { "length, mm" } th { "diameter, mm" }
+                th { "reference, mm" } }
+            @for lesion in lesions {
+                tr {
+                    td { (format!("{:.0}", lesion.percent())) }
+                    td { (lesion.branch) }
+                    td { (format!("{:.1}", lesion.from_root_mm)) }
+                    td { (format!("{:.1}", lesion.length_mm)) }
+                    td { (format!("{:.2}", lesion.min_diameter_mm)) }
+                    td { (format!("{:.2}", lesion.reference_diameter_mm)) }
+                }
             }
         }
     }

@@ -260,6 +260,7 @@ pub(super) fn phantoms(
             phases: section.phases.unwrap_or(USUAL_PHASES),
             views: angles,
             seed: 0,
+            stenoses: Vec::new(),
             degradations: degradations.clone(),
             layout: Layout::Native,
             anatomy: anatomy.clone(),

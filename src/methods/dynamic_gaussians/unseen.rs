@@ -1,8 +1,8 @@
 //! Motion of the vessels that contrast does not show at a phase. Where contrast shows a part of the vessels, the motion of this part
 //! determines a mixture of the motion at other phases; where it shows nothing, the motion follows a smooth curve through the other phases.
 
-use crate::calibrate::linear::Symmetric;
 use crate::gaussians::field::{DeformableGaussians, mass, shares, vector};
+use crate::linear::Symmetric;
 use glam::DVec3;
 
 /// Share of the vessels' mass from which on a phase is seen well.

@@ -1,9 +1,9 @@
 //! A Gauss-Newton step on poses, displacements of the heart and contrasts, with the field fixed.
 
-use crate::calibrate::linear::Symmetric;
 use crate::calibrate::pose::{Poses, ViewPose};
 use crate::error::{Error, Result};
 use crate::geometry::MM_PER_UNIT;
+use crate::linear::Symmetric;
 use crate::methods::dynamic_gaussians::adjust::poses::Stands;
 use crate::methods::dynamic_gaussians::adjust::residual::{ActiveImage, active_images};
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;

@@ -1,0 +1,74 @@
+//! Stenoses of phantoms and of the trees that are found in them, through the program.
+
+use crate::program::program;
+use serde_json::Value;
+use std::path::Path;
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+#[track_caller]
+fn ok(args: &[&str]) -> String {
+    let out = program().args(args).output().unwrap();
+    assert!(out.status.success(), "{args:?}: {}", String::from_utf8_lossy(&out.stderr));
+    String::from_utf8_lossy(&out.stderr).into_owned()
+}
+
+fn read(path: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+}
+
+/// Trains on a phantom with further options; returns its truth, its tree, and the words of the tree command.
+fn lesions_of(directory: &Path, more: &[&str]) -> (Value, Value, String) {
+    let at = |name: &str| directory.join(name);
+    let size = ["--size", "80", "--phases", "6", "--no-volumes"];
+    ok(&[&["phantom", text(&at("data"))], &size[..], more].concat());
+    ok(&["train", text(&at("data")), "-o", text(&at("run")), "--no-eval", "--stop-at", "130", "--tree"]);
+    let said = ok(&["tree", text(&at("run")), "--phase", "0", "-o", text(&at("tree.json"))]);
+    (read(&at("data/truth.json")), read(&at("tree.json"))["phases"][0].clone(), said)
+}
+
+#[test]
+fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
+    let directory = tempfile::tempdir().unwrap();
+    let (ill, healthy) = (directory.path().join("ill"), directory.path().join("healthy"));
+    let (truth, tree, said) = lesions_of(&ill, &["--stenosis", "LAD,10,60%,6"]);
+    let [true_lesion] = &truth["lesions"].as_array().unwrap()[..] else { panic!("{truth}") };
+    let [lesion] = &tree["lesions"].as_array().unwrap()[..] else { panic!("{}", tree["lesions"]) };
+    let number = |value: &Value, field: &str| value[field].as_f64().unwrap();
+    let off = |ours: &str, theirs: &str| (number(lesion, ours) - number(true_lesion, theirs)).abs();
+    println!("{lesion}, {true_lesion}");
+    assert!(off("min_diameter_mm", "min_diameter_mm") < 0.25, "{lesion}, {true_lesion}");
+    assert!(off("stenosis_percent", "percent") < 15.0, "{lesion}, {true_lesion}");
+    assert!(off("from_root_mm", "from_ostium_mm") < 3.0, "{lesion}, {true_lesion}");
+    assert!(said.contains("phase 0: stenosis of "), "{said}");
+    let page = std::fs::read_to_string(ill.join("run/report.html")).unwrap();
+    assert!(page.contains("stenosis, %"), "the report has a table of stenoses");
+
+    let (truth, tree, said) = lesions_of(&healthy, &[]);
+    assert!(truth.get("lesions").is_none(), "a truth without lesions has no such field");
+    assert_eq!(tree["lesions"].as_array().unwrap().len(), 0, "{}", tree["lesions"]);
+    assert!(!said.contains("stenosis"), "{said}");
+}
+
+#[test]
+fn stenoses_that_cannot_be_made_are_refused_with_the_reason() {
+    let directory = tempfile::tempdir().unwrap();
+    for (asked, reason) in [
+        ("RCA,10,60,6", "its branches are: LM, LAD, LCx"),
+        ("LAD,500,60,6", "mm long"),
+        ("LAD,10,60", "BRANCH,POSITION,DIAMETER%,LENGTH"),
+        ("LAD,10,sixty,6", "BRANCH,POSITION,DIAMETER%,LENGTH"),
+        ("LAD,10,100,6", "0 to 95 %"),
+    ] {
+        let out = program()
+            .args(["phantom", text(&directory.path().join("data")), "--size", "16", "--phases", "2"])
+            .args(["--stenosis", asked])
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&out.stderr);
+        assert!(!out.status.success() && said.contains(reason), "{asked}: {said}");
+        assert!(!directory.path().join("data/dataset.json").exists(), "{asked}");
+    }
+}
