@@ -346,7 +346,7 @@ fn ctrl_c_saves() {
 #[test]
 fn kept_results_are_of_their_studies_and_make_their_tables() {
     let root = crate::root::root().join("studies");
-    for name in ["scaled-table1", "scaled-table2"] {
+    for name in ["scaled-table1", "scaled-table2", "ablation"] {
         let (kept, home) = (root.join("measured").join(name), tempfile::tempdir().unwrap());
         let file = root.join(format!("{name}.toml"));
         let mut results = 0;
