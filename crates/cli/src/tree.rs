@@ -169,7 +169,7 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
             tree.components()
         );
     }
-    // Followed points keep their radii, so that all phases have the same lesions.
+    // Followed points keep their radii, so that lesions differ between phases only as far as lengths change.
     let with_lesions = if beat.reference_phase.is_some() { 1 } else { beat.phases.len() };
     for tree in beat.phases.iter().take(with_lesions) {
         for lesion in lesions(tree, beat.resolution_mm) {

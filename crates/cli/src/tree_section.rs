@@ -152,6 +152,7 @@ fn lesion_table(lesions: &[Lesion]) -> Markup {
         return html! { p { "No stenosis of " (format!("{MIN_PERCENT:.0}")) " % or more was found." } };
     }
     html! {
+        p { "Stenoses of " (format!("{MIN_PERCENT:.0}")) " % or more:" }
         table {
             tr { th { "stenosis, %" } th { "branch" } th { "from the root, mm" } th { "length, mm" } th { "diameter, mm" }
                 th { "reference, mm" } }
