@@ -1,4 +1,4 @@
-//! Dense symmetric positive definite systems of some hundred unknowns.
+//! Symmetric positive definite systems: dense ones of some hundred unknowns, and banded ones of any size.
 
 /// The lower triangle of a symmetric matrix, row by row.
 #[derive(Debug, Clone, PartialEq)]
@@ -61,6 +61,59 @@ impl Symmetric {
     }
 }
 
+/// A symmetric matrix with two diagonals on each side of the main one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Pentadiagonal {
+    /// Diagonals: the main one, the entries (i + 1, i) and the entries (i + 2, i); all as long as the main one.
+    diagonals: [Vec<f64>; 3],
+}
+
+impl Pentadiagonal {
+    /// Returns a matrix of zeros.
+    pub fn zeros(n: usize) -> Pentadiagonal {
+        Pentadiagonal { diagonals: [vec![0.0; n], vec![0.0; n], vec![0.0; n]] }
+    }
+
+    /// Adds to an entry and its mirror, which may be two places from the main diagonal at most.
+    pub fn add(&mut self, i: usize, j: usize, value: f64) {
+        self.diagonals[i.abs_diff(j)][i.min(j)] += value;
+    }
+
+    /// Solves `self x = right` by L D L^T in time proportional to the size; `None` where the matrix is not positive definite.
+    pub fn solve(&self, right: &[f64]) -> Option<Vec<f64>> {
+        let [main, first, second] = &self.diagonals;
+        let n = main.len();
+        let (mut d, mut one, mut two) = (vec![0.0; n], vec![0.0; n], vec![0.0; n]);
+        let mut x = right.to_vec();
+        for i in 0..n {
+            d[i] = main[i];
+            let mut below = first[i];
+            if i >= 1 {
+                d[i] -= one[i - 1] * one[i - 1] * d[i - 1];
+                below -= two[i - 1] * one[i - 1] * d[i - 1];
+                x[i] -= one[i - 1] * x[i - 1];
+            }
+            if i >= 2 {
+                d[i] -= two[i - 2] * two[i - 2] * d[i - 2];
+                x[i] -= two[i - 2] * x[i - 2];
+            }
+            if !(d[i].is_finite() && d[i] > 0.0) {
+                return None;
+            }
+            (one[i], two[i]) = (below / d[i], second[i] / d[i]);
+        }
+        for i in (0..n).rev() {
+            x[i] /= d[i];
+            for (offset, factor) in [(1, one[i]), (2, two[i])] {
+                if i + offset < n {
+                    x[i] -= factor * x[i + offset];
+                }
+            }
+        }
+        Some(x)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -79,5 +132,23 @@ mod tests {
         }
         matrix.add(0, 0, -5.0);
         assert_eq!(matrix.solve(&[1.0; 3]), None);
+    }
+
+    #[test]
+    fn a_banded_system_has_the_solution_of_the_dense_one() {
+        for n in [1, 2, 3, 9] {
+            let (mut banded, mut dense) = (Pentadiagonal::zeros(n), Symmetric::zeros(n));
+            for i in 0..n {
+                for j in i.saturating_sub(2)..=i {
+                    let value = if i == j { 5.0 + i as f64 } else { 0.3 * (1 + i + 2 * j) as f64 / n as f64 - 0.8 };
+                    banded.add(i, j, value);
+                    dense.add(i, j, value);
+                }
+            }
+            let right: Vec<f64> = (0..n).map(|i| (i as f64).sin() + 0.5).collect();
+            let (ours, theirs) = (banded.solve(&right).unwrap(), dense.solve(&right).unwrap());
+            assert!(ours.iter().zip(&theirs).all(|(a, b)| (a - b).abs() < 1e-12), "{n}: {ours:?}, {theirs:?}");
+        }
+        assert_eq!(Pentadiagonal::zeros(3).solve(&[1.0; 3]), None);
     }
 }

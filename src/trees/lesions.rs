@@ -1,6 +1,6 @@
 //! Stenoses: places where a vessel is narrower than its course elsewhere lets expect.
 
-use crate::linear::Symmetric;
+use crate::linear::Pentadiagonal;
 use crate::trees::tree::PhaseTree;
 use glam::DVec3;
 use std::f64::consts::TAU;
@@ -195,8 +195,11 @@ fn sharpened(radius_mm: &[f64], deviation_steps: f64) -> Vec<f64> {
 fn recovered(radius_mm: &[f64], places: usize) -> Vec<f64> {
     let greatest = |part: &[f64]| part.iter().copied().fold(0.0, f64::max);
     let at = |i: usize| {
-        let (before, behind) = (&radius_mm[i.saturating_sub(places)..=i], &radius_mm[i..]);
-        greatest(before).min(greatest(&behind[..behind.len().min(places + 1)]))
+        let (before, behind) = (
+            &radius_mm[i.saturating_sub(places)..=i],
+            &radius_mm[i..radius_mm.len().min(i.saturating_add(places).saturating_add(1))],
+        );
+        greatest(before).min(greatest(behind))
     };
     (0..radius_mm.len()).map(at).collect()
 }
@@ -206,7 +209,7 @@ fn reference(radius_mm: &[f64], step_mm: f64) -> Option<Vec<f64>> {
     let n = radius_mm.len();
     let stiffness = (REFERENCE_MM / (TAU * step_mm)).powi(4);
     // The sum of squared second differences.
-    let mut bending = Symmetric::zeros(n);
+    let mut bending = Pentadiagonal::zeros(n);
     for middle in 1..n - 1 {
         let terms = [(middle - 1, 1.0), (middle, -2.0), (middle + 1, 1.0)];
         for (a, (i, of_i)) in terms.iter().enumerate() {
