@@ -115,13 +115,13 @@ mod tests {
     }
 
     #[test]
-    fn a_method_has_at_most_thirty_settings_and_all_have_at_most_a_hundred() {
+    fn a_method_has_at_most_thirty_one_settings_and_all_have_at_most_a_hundred() {
         let mut all = std::collections::BTreeSet::new();
         for preset in Preset::ALL.iter().copied() {
             let printed: toml::Table = Config::preset(preset).acting_toml().unwrap().parse().unwrap();
             // A preset is chosen by --preset.
             let keys: Vec<String> = keys(&printed).into_iter().filter(|key| key != "preset").collect();
-            assert!(keys.len() <= 30, "{preset:?}: {} settings {keys:?}", keys.len());
+            assert!(keys.len() <= 31, "{preset:?}: {} settings {keys:?}", keys.len());
             all.extend(keys);
         }
         assert!(all.len() <= 100, "{} settings", all.len());

@@ -5,11 +5,12 @@ use crate::config::section::section;
 use serde::{Deserialize, Serialize};
 
 /// Keys of a run with a static tensor field.
-pub(super) const TENSOR_KEYS: [&str; 8] = [
+pub(super) const TENSOR_KEYS: [&str; 9] = [
     "train.rays",
     "march.static_samples",
     "static.grid",
     "static.ranks",
+    "static.half_extent_mm",
     "static.lr",
     "static.lr_end",
     "static.tv",
