@@ -1122,6 +1122,22 @@ nertca_status nertca_reconstruction_set_r_peaks(nertca_reconstruction *reconstru
                                                 size_t count);
 
 /**
+ * States vessels that are known before, for example from a CT: points along their centrelines, about a millimetre apart, as patient mm
+ * (left, posterior, superior) with the isocentre at the origin. They decide where vessels are sought first; the angiograms decide whether
+ * they are there. A call replaces the points given earlier and acts on fits that begin later. A null `points_mm` with a `count` of 0
+ * clears them. Callable from any thread.
+ *
+ * @return NERTCA_ERROR_ARGUMENT for coordinates that are not finite, and with a preset other than `fast`; NERTCA_ERROR_BUSY while
+ * training in the background in a deterministic context.
+ *
+ * # Safety
+ * `points_mm` must be readable for 3 x `count` numbers, the three coordinates of a point together.
+ */
+nertca_status nertca_reconstruction_set_prior(nertca_reconstruction *reconstruction,
+                                              const double *points_mm,
+                                              size_t count);
+
+/**
  * Returns state and progress of training. Callable from any thread, at any time.
  *
  * @return NERTCA_OK also when training has failed: `state` is then `NERTCA_STATE_FAILED`, and `nertca_reconstruction_failure`

@@ -18,6 +18,7 @@ mod section;
 pub mod sections;
 mod x_gaussian;
 
+use crate::choice::Choice;
 use crate::error::{Error, Result};
 use crate::files;
 pub use forms::{
@@ -232,6 +233,18 @@ impl Config {
         self.method() == MethodKind::DynamicGaussians
     }
 
+    /// Checks that the method uses vessels that are known before; `field` and `value` tell where they come from.
+    ///
+    /// # Errors
+    /// [`Error::Config`].
+    pub fn takes_prior(&self, field: &str, value: &str) -> Result<()> {
+        if self.method() == MethodKind::DynamicGaussians {
+            return Ok(());
+        }
+        let problem = format!("is used by the preset `fast` only, and the preset is `{}`", Choice::name(self.preset));
+        Err(Error::config(field, value, problem))
+    }
+
     /// Returns the number of iterations at the start of the run that fit Gaussians; the others fit the static field.
     pub fn gaussian_iterations(&self) -> u32 {
         match self.gaussians.form {
@@ -308,7 +321,6 @@ fn merge(base: &mut toml::Table, overlay: toml::Table, prefix: &str) -> Result<(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::choice::Choice;
 
     #[test]
     fn more_first_gaussians_than_there_is_room_for_are_refused_however_many() {

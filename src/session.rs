@@ -4,6 +4,7 @@
 //! Threads: every function may be called from any thread at any time. Training holds the engine for a few iterations
 //! at a time; drawing never waits for more than those.
 
+mod adjusting;
 mod corrected;
 mod engine;
 mod inbox;
@@ -26,6 +27,7 @@ use crate::render::quantity::Quantity;
 use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::at_rest;
 use crate::scan::gating::{BeatTime, RPeaks};
+use crate::scan::prior::VesselPrior;
 use crate::trees::extract::{TreeOptions, vessel_trees};
 use crate::trees::tree::BeatTree;
 pub use corrected::CorrectedFrame;
@@ -74,7 +76,7 @@ impl Session {
         if let Some(attenuation) = options.vessel_attenuation_per_mm {
             positive("vessel_attenuation_per_mm", attenuation)?;
         }
-        let inbox = Inbox { options, views: Vec::new(), frames: Vec::new(), r_peaks: None };
+        let inbox = Inbox { options, views: Vec::new(), frames: Vec::new(), prior: None, r_peaks: None };
         Ok(Session {
             shared: Arc::new(Shared {
                 _pipelines: gpu.as_ref().map(Gpu::keep_pipelines),
@@ -211,6 +213,25 @@ impl Session {
         })
     }
 
+    /// States vessels that are known before, for example from a CT; replaces earlier ones. None clears them. Fits that begin later seed
+    /// their Gaussians by them; those under way go on.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for a method without a prior, for a prior without points, and for coordinates that are not finite;
+    /// [`Error::Busy`] while a deterministic session is training.
+    pub fn set_prior(&self, prior: Option<VesselPrior>) -> Result<()> {
+        if let Some(prior) = &prior {
+            prior.check()?;
+        }
+        self.change_frames(|inbox| {
+            if prior.is_some() {
+                inbox.options.config.takes_prior("prior", "vessels")?;
+            }
+            inbox.prior = prior.map(Arc::new);
+            Ok(())
+        })
+    }
+
     fn announce(&self) {
         self.shared.version.fetch_add(1, Ordering::AcqRel);
         // The lock keeps the news from falling between a worker's look and its wait.
@@ -262,7 +283,8 @@ impl Session {
     }
 
     /// Trains up to `iterations` more, with the frames there are, and returns how many were done: fewer at the end of
-    /// the run, or when the observer ends it, or [`Session::close`].
+    /// the run, or when the observer ends it, or [`Session::close`]. Views are calibrated, but not adjusted: only training in the background
+    /// does so.
     ///
     /// # Errors
     /// [`Error::Busy`] while it trains already, [`Error::NotReady`] without frames enough, [`Error::NoDevice`];
@@ -302,7 +324,9 @@ impl Session {
         }
     }
 
-    /// Trains in the background until the run is done, paused or stopped; waits for frames while there are too few.
+    /// Trains in the background until the run is done, paused or stopped; waits for frames while there are too few. At the end of the
+    /// run, the views are adjusted where `calibrate.adjust` is `auto`, while the reconstruction so far is shown, and training goes on with
+    /// the corrected views.
     ///
     /// # Errors
     /// [`Error::Busy`] when it trains already; [`Error::NoDevice`].

@@ -287,6 +287,23 @@ class Reconstruction:
         given = ffi.from_buffer("double[]", times) if len(times) else ffi.NULL
         check(lib.nertca_reconstruction_set_r_peaks(handle, given, len(times)), handle)
 
+    def set_prior(self, points_mm: "npt.ArrayLike") -> None:
+        """States vessels that are known before, for example from a CT: an array of shape (N, 3) of points along their centrelines,
+        about a millimetre apart, in patient mm (left, posterior, superior) with the isocentre at the origin.
+
+        They decide where vessels are sought first; the angiograms decide whether they are there. Replaces the points given
+        earlier and acts on fits that begin later; an empty array clears them. Needs the preset `fast`.
+        """
+        try:
+            points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise wrong("points_mm", "are not numbers") from None
+        if points.size and (points.ndim != 2 or points.shape[1] != 3):
+            raise wrong("points_mm", f"an array of shape {points.shape}; (N, 3) is needed")
+        handle = self.handle
+        given = ffi.from_buffer("double[]", points) if points.size else ffi.NULL
+        check(lib.nertca_reconstruction_set_prior(handle, given, points.size // 3), handle)
+
     def correction(self, frame: int) -> Correction:
         """How the reconstruction sees a frame since training last took frames in: as stated, or as calibration corrected it.
 

@@ -17,6 +17,7 @@ use crate::choice::Choice;
 use crate::config::{Config, Preset};
 use crate::scan::at_rest;
 use crate::scan::gating::RPeaks;
+use crate::scan::prior::{MAX_PRIOR_POINTS, VesselPrior};
 use crate::session::{FrameUse, Progress, Session, SessionOptions};
 use crate::trees::tree::BeatTree;
 use std::ffi::{c_char, c_void};
@@ -284,6 +285,39 @@ pub unsafe extern "C" fn nertca_reconstruction_set_r_peaks(
         // SAFETY: the pointer is not null, and the header requires `count` numbers, which need no alignment.
         let times = (0..count).map(|i| unsafe { times_s.add(i).read_unaligned() }).collect::<Vec<_>>();
         Ok(reconstruction.session.set_r_peaks(Some(RPeaks::new(&times)?))?)
+    })
+}
+
+/// States vessels that are known before, for example from a CT: points along their centrelines, about a millimetre apart, as patient mm
+/// (left, posterior, superior) with the isocentre at the origin. They decide where vessels are sought first; the angiograms decide whether
+/// they are there. A call replaces the points given earlier and acts on fits that begin later. A null `points_mm` with a `count` of 0
+/// clears them. Callable from any thread.
+///
+/// @return NERTCA_ERROR_ARGUMENT for coordinates that are not finite, and with a preset other than `fast`; NERTCA_ERROR_BUSY while
+/// training in the background in a deterministic context.
+///
+/// # Safety
+/// `points_mm` must be readable for 3 x `count` numbers, the three coordinates of a point together.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_set_prior(
+    reconstruction: *mut nertca_reconstruction,
+    points_mm: *const f64,
+    count: usize,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        if points_mm.is_null() && count == 0 {
+            return Ok(reconstruction.session.set_prior(None)?);
+        }
+        if points_mm.is_null() {
+            return Err(Failure::argument("points_mm", "is null"));
+        }
+        if count > MAX_PRIOR_POINTS {
+            return Err(Failure::argument("count", format!("{count} exceeds the maximum, {MAX_PRIOR_POINTS}")));
+        }
+        // SAFETY: the pointer is not null, and the header requires `3 * count` numbers, which need no alignment.
+        let coordinate = |i: usize| unsafe { points_mm.add(i).read_unaligned() };
+        let points = (0..count).map(|i| [0, 1, 2].map(|axis| coordinate(3 * i + axis))).collect();
+        Ok(reconstruction.session.set_prior(Some(VesselPrior { shapes_mm: vec![points] }))?)
     })
 }
 

@@ -5,7 +5,7 @@ use crate::formats::volume::{Volume, VolumeHints};
 use crate::formats::volume_files;
 use crate::phantom::tree::Tree;
 use crate::phantom::tree_file::TreeFile;
-use crate::scan::prior::VesselPrior;
+use crate::scan::prior::{MAX_PRIOR_POINTS, VesselPrior};
 use glam::DVec3;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,8 +14,6 @@ use std::path::Path;
 const STEP_MM: f64 = 1.0;
 /// Share of a volume's maximum from which on a voxel is vessel.
 const VESSEL_SHARE: f32 = 0.5;
-/// Maximum number of points: a coronary tree has a few hundred at a distance of a mm.
-const MAX_POINTS: usize = 50_000;
 /// Endings of the names of tree files.
 const TREE_FILES: [&str; 3] = ["json", "vtp", "pvd"];
 
@@ -36,9 +34,9 @@ pub fn read(path: &Path) -> Result<VesselPrior> {
     if most == 0 {
         return Err(Error::data(path, "vessels", "no vessel is there: no voxel is positive"));
     }
-    if most > MAX_POINTS {
+    if most > MAX_PRIOR_POINTS {
         let problem = format!(
-            "there are {most} points at a distance of {STEP_MM} mm, more than {MAX_POINTS}: state the vessels alone, for example as \
+            "there are {most} points at a distance of {STEP_MM} mm, more than {MAX_PRIOR_POINTS}: state the vessels alone, for example as \
              the mask of a segmentation"
         );
         return Err(Error::data(path, "vessels", problem));

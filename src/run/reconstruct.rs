@@ -187,12 +187,15 @@ fn calibrated(
     } else {
         let mut calibration = calibrate(dataset, config)?;
         let task = AdjustTask { gpu, config, dataset, calibration: &calibration };
-        let mut observe = |share: f64| match options.cancel.load(Ordering::Relaxed) {
-            true => Err(Error::Interrupted),
-            false => {
-                observe(&Event::Adjusting { share });
-                Ok(())
+        let mut shown = None;
+        let mut observe = |share: f64| {
+            if options.cancel.load(Ordering::Relaxed) {
+                return Err(Error::Interrupted);
             }
+            if shown.replace(share) != Some(share) {
+                observe(&Event::Adjusting { share });
+            }
+            Ok(())
         };
         if let Some(outcome) = methods::of(config).adjust(&task, &mut observe)? {
             calibration = adjusted(dataset, calibration, outcome.adjusted)?;

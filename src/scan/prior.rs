@@ -8,6 +8,8 @@ use std::path::Path;
 
 /// File of the prior in a run directory.
 pub const PRIOR: &str = "prior.json";
+/// Maximum number of points of a prior: a coronary tree has a few hundred at a distance of a mm.
+pub const MAX_PRIOR_POINTS: usize = 50_000;
 /// Maximum size of that file.
 const MAX_BYTES: u64 = 1 << 28;
 
@@ -25,6 +27,21 @@ impl VesselPrior {
         let shapes = self.shapes_mm.len().max(1);
         let nearest = (fraction * shapes as f64).round() as usize % shapes;
         self.shapes_mm.get(nearest).into_iter().flatten().map(|point| DVec3::from_array(*point)).collect()
+    }
+
+    /// Checks that there are points, and that all coordinates are finite.
+    ///
+    /// # Errors
+    /// [`Error::Config`].
+    pub fn check(&self) -> Result<()> {
+        let points = || self.shapes_mm.iter().flatten();
+        if points().next().is_none() {
+            return Err(Error::config("prior", "no point", "states no vessel"));
+        }
+        match points().position(|point| point.iter().any(|value| !value.is_finite())) {
+            Some(at) => Err(Error::config("prior", format!("point {at}"), "has a coordinate that is not finite")),
+            None => Ok(()),
+        }
     }
 
     /// Writes the prior into a run directory.

@@ -3,8 +3,8 @@
 use crate::calibrate::calibrate;
 use crate::calibrate::correction::Calibration;
 use crate::checkpoint::Checkpoint;
-use crate::config::{AdjustMode, CalibrateMode};
 use crate::error::{Error, Result};
+use crate::fitting::fit::AdjustTask;
 use crate::gpu::device::Gpu;
 use crate::gpu::pipeline::KeptPipelines;
 use crate::kernels::tuning::Tuning;
@@ -15,6 +15,7 @@ use crate::plan::Plan;
 use crate::render::live::{Live, Refresh, Source};
 use crate::render::quantity::Quantity;
 use crate::render::renderer::Interlude;
+use crate::session::adjusting::{AdjustedViews, CorrectedViews, adjust};
 use crate::session::inbox::{Inbox, Taken};
 use crate::session::long_work::{LongViewer, LongWork};
 use crate::session::progress::{Observer, Progress, State};
@@ -82,6 +83,8 @@ pub(super) struct Engine {
     /// Version of the inbox from which the trainer was built.
     pub(super) version: u64,
     pub(super) frames: u32,
+    /// Version of the inbox whose views were adjusted, or need no adjustment; 0 for none.
+    pub(super) adjusted: u64,
     /// Pause before new frames are taken in.
     pub(super) settling: Option<Settling>,
 }
@@ -121,6 +124,15 @@ pub struct Drawn {
     pub frames: u32,
     /// Iterations of the oldest part that the picture shows.
     pub step: u32,
+}
+
+/// Training after the adjustment of views.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum AfterAdjusting {
+    /// The views stay as they are, so that training has ended.
+    Ended,
+    /// The views were corrected, and training goes on with them.
+    TrainsOn,
 }
 
 /// State of training, for those who wait for it.
@@ -332,30 +344,19 @@ impl Shared {
             return Ok(());
         }
         let started = Instant::now();
-        let ((dataset, taken), mut config, left_out) = {
+        let ((dataset, taken), config, left_out) = {
             let inbox = lock(&self.inbox);
             let left_out = inbox.leaves_out().then(|| inbox.why_left_out());
-            (inbox.training_dataset()?, inbox.options.config.clone(), left_out)
+            (inbox.training_dataset()?, inbox.training_config(), left_out)
         };
         begin();
         if let Some(why) = left_out {
             tracing::info!("some frames are not used: {why}");
         }
-        let mut tuning = tuning.clone();
-        if gpu.info().is_cpu() {
-            // Views wait for what was submitted before them.
-            tuning.iterations_per_submit = Some(1);
-        }
+        let tuning = beside_pictures(gpu, tuning);
         dataset.notes.iter().for_each(|note| tracing::info!("{note}"));
         let calibration = calibrate(&dataset, &config)?;
         calibration.notes.iter().for_each(|note| tracing::info!("{note}"));
-        if config.calibrate.adjust == AdjustMode::Auto && config.calibrate.mode == CalibrateMode::Auto {
-            tracing::info!("sessions calibrate views without the adjustment that `nertca-vk train` makes");
-        }
-        if config.gaussians.fits == 0 {
-            // Pictures are wanted while frames arrive, and a mean of fits cannot go on with new ones.
-            config.gaussians.fits = 1;
-        }
         let dataset = dataset.corrected(&calibration)?;
         let fresh = Plan::new(&config, &dataset)?;
         let mut earlier = None;
@@ -391,6 +392,60 @@ impl Shared {
         *lock(&self.taken) = taken;
         let took = started.elapsed();
         engine.settling = Some(Settling { until: Instant::now() + took * SETTLE, quiet: took.max(QUIET) });
+        self.show(engine, trainer)
+    }
+
+    /// Adjusts the views of the frames that training has ended with, `version` of the inbox, once. The reconstruction so far is shown
+    /// meanwhile.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`] where frames have changed meanwhile, or training is to stop or to pause; device errors.
+    fn adjust_views(&self, version: u64) -> Result<AfterAdjusting> {
+        let (gpu, tuning) = self.device()?;
+        if lock(&self.engine).adjusted == version {
+            return Ok(AfterAdjusting::Ended);
+        }
+        let (dataset, mut config) = {
+            let inbox = lock(&self.inbox);
+            (inbox.training_dataset()?.0, inbox.training_config())
+        };
+        let tuning = beside_pictures(gpu, tuning);
+        config.train.iterations_per_submit = tuning.iterations_per_submit.unwrap_or(config.train.iterations_per_submit);
+        let calibration = lock(&self.calibration).clone().unwrap_or_else(|| Calibration::none(None));
+        let task = AdjustTask { gpu, config: &config, dataset: &dataset, calibration: &calibration };
+        let proceed = || {
+            gpu.looks().give_way();
+            self.goes_on(version)
+        };
+        let AdjustedViews { calibration, corrected } = adjust(&task, &proceed)?;
+        self.goes_on(version)?;
+        let Some(CorrectedViews { dataset, made }) = corrected else {
+            lock(&self.engine).adjusted = version;
+            *lock(&self.calibration) = Some(calibration);
+            return Ok(AfterAdjusting::Ended);
+        };
+        let plan = Plan::new(&config, &dataset)?;
+        let mut engine = lock(&self.engine);
+        self.goes_on(version)?;
+        // The state that was saved belongs to other views; the memory of its trainer is needed.
+        (engine.saved, engine.training) = (None, None);
+        self.free_fields();
+        let trainer = Trainer::after_adjustment(gpu, plan, &dataset, tuning, made.as_ref())?;
+        engine.adjusted = version;
+        *lock(&self.calibration) = Some(calibration);
+        self.show(&mut engine, trainer)?;
+        Ok(AfterAdjusting::TrainsOn)
+    }
+
+    /// Returns an error where the frames are no longer those of `version`, or training is to stop or to pause.
+    fn goes_on(&self, version: u64) -> Result<()> {
+        let ends = self.stop.load(Ordering::Acquire) || self.pause.load(Ordering::Acquire);
+        let is_current = self.version.load(Ordering::Acquire) == version;
+        if ends || !is_current { Err(Error::Interrupted) } else { Ok(()) }
+    }
+
+    /// Trains and shows a trainer from now on.
+    fn show(&self, engine: &mut Engine, trainer: Trainer) -> Result<()> {
         self.step.store(trainer.step(), Ordering::Release);
         let shown = (!trainer.shows_earlier()).then_some(engine.frames);
         let source = Source { outline: trainer.outline(), feed: trainer.feed() };
@@ -544,7 +599,11 @@ impl Shared {
                 return Ok(State::Cancelled);
             }
             if done {
-                return Ok(State::Finished);
+                match self.adjust_views(version) {
+                    Ok(AfterAdjusting::Ended) => return Ok(State::Finished),
+                    Ok(AfterAdjusting::TrainsOn) | Err(Error::Interrupted) => continue,
+                    Err(error) => return Err(error),
+                }
             }
             if at_end {
                 // More frames may follow those that came last.
@@ -575,6 +634,16 @@ impl Shared {
         let control = lock(&self.control);
         has_work(control.state, control.waits_at, self.version.load(Ordering::Acquire))
     }
+}
+
+/// Returns the tuning of work beside which pictures are drawn.
+fn beside_pictures(gpu: &Gpu, tuning: &Tuning) -> Tuning {
+    let mut tuning = tuning.clone();
+    if gpu.info().is_cpu() {
+        // Views wait for what was submitted before them.
+        tuning.iterations_per_submit = Some(1);
+    }
+    tuning
 }
 
 /// Time without a new frame after which no other is expected soon, at most `longest`: a fit that begins without the last frames of a run is

@@ -8,9 +8,11 @@ use crate::scan::canvas::onto_canvas;
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use crate::scan::frame_checks::{Complaint, check_phase, check_values};
 use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
+use crate::scan::prior::VesselPrior;
 use crate::scan::same_view::{SAME_VIEW_PX, find_or_add};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
+use std::sync::Arc;
 
 /// Options of a session.
 #[derive(Debug, Clone)]
@@ -108,6 +110,8 @@ pub(super) struct Inbox {
     pub(super) views: Vec<View>,
     /// Frames in the order in which they were added; none where a frame was removed.
     pub(super) frames: Vec<Option<Kept>>,
+    /// Vessels that are known before.
+    pub(super) prior: Option<Arc<VesselPrior>>,
     pub(super) r_peaks: Option<RPeaks>,
 }
 
@@ -294,7 +298,7 @@ impl Inbox {
             depth_range: (-half, half),
             vessel_attenuation: self.options.vessel_attenuation_per_mm.map(|a| a * MM_PER_UNIT),
             still: self.options.still,
-            prior: None,
+            prior: self.prior.clone(),
             notes,
         };
         dataset.hide();
@@ -317,6 +321,16 @@ impl Inbox {
             )));
         }
         Ok((dataset, taken))
+    }
+
+    /// The configuration of training.
+    pub(super) fn training_config(&self) -> Config {
+        let mut config = self.options.config.clone();
+        if config.gaussians.fits == 0 {
+            // Pictures are wanted while frames arrive, and a mean of fits cannot go on with new ones.
+            config.gaussians.fits = 1;
+        }
+        config
     }
 
     /// Explains how many training frames are left out and why.

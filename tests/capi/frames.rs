@@ -315,6 +315,19 @@ fn an_object_at_rest_is_reconstructed_as_the_same_dataset_is() {
 }
 
 #[test]
+fn a_prior_is_taken_by_methods_that_use_it() {
+    let context = context("device = none");
+    let points = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0];
+    for (preset, status) in [("fast", NERTCA_OK), ("fast-mlp", NERTCA_ERROR_ARGUMENT)] {
+        let made = reconstruction(context, &format!("phases = 10\npreset = {preset}"));
+        assert_eq!(unsafe { nertca_reconstruction_set_prior(made, points.as_ptr(), 2) }, status, "{preset}");
+        ok(unsafe { nertca_reconstruction_set_prior(made, null(), 0) }, made);
+        ok(unsafe { nertca_reconstruction_destroy(made) }, null::<std::ffi::c_void>());
+    }
+    close(context, &[]);
+}
+
+#[test]
 fn a_frame_at_the_r_peak_is_half_a_phase_before_the_first() {
     let context = context("device = none");
     let made = reconstruction(context, "phases = 10");

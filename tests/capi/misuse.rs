@@ -238,6 +238,14 @@ fn reconstructions(b: &Bench) {
     b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "at least two are needed", set(times.as_ptr(), 1));
     b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "must increase", set([1.0, 0.5].as_ptr(), 2));
     b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "not a time", set([1.0, f64::INFINITY].as_ptr(), 2));
+    let prior = "nertca_reconstruction_set_prior";
+    let points = [0.0, 1.0, 2.0];
+    b.handles(prior, stale(b), b.context.cast(), |h| unsafe { nertca_reconstruction_set_prior(h, points.as_ptr(), 1) });
+    let set = |points: *const f64, n| unsafe { nertca_reconstruction_set_prior(b.bare, points, n) };
+    b.refuses(prior, NERTCA_ERROR_ARGUMENT, "points_mm", set(null(), 1));
+    b.refuses(prior, NERTCA_ERROR_ARGUMENT, "no point", set(points.as_ptr(), 0));
+    b.refuses(prior, NERTCA_ERROR_ARGUMENT, "count", set(points.as_ptr(), usize::MAX));
+    b.refuses(prior, NERTCA_ERROR_ARGUMENT, "point 0: has a coordinate", set([0.0, f64::NAN, 0.0].as_ptr(), 1));
     let phase_of = "nertca_reconstruction_beat_phase";
     let mut phase = 0.0;
     let ask = |h, time_s, phase| unsafe { nertca_reconstruction_beat_phase(h, time_s, phase) };

@@ -179,6 +179,10 @@ impl Pool {
                 }
                 unsafe { nertca_reconstruction_add_frame(r, &frame) }
             }
+            10 if self.random.below(2) == 0 => {
+                let points: Vec<f64> = (0..3 * self.random.below(4)).map(|_| self.random.number()).collect();
+                unsafe { nertca_reconstruction_set_prior(self.reconstruction(), points.as_ptr(), points.len() / 3) }
+            }
             10 => {
                 let times: Vec<f64> = (0..self.random.below(4)).map(|i| i as f64 + self.random.number()).collect();
                 unsafe { nertca_reconstruction_set_r_peaks(self.reconstruction(), times.as_ptr(), times.len()) }

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 use nertca_vk::calibrate::gauge::{FrameRays, RigidMotion, common_motion};
-use nertca_vk::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays, world_from_lps_mm};
+use nertca_vk::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays, lps_mm_from_world, world_from_lps_mm};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::phantom::projector::{LoadedVolume, Projector};
 use nertca_vk::phantom::tree::{Bounds, Heart, Tree};
@@ -171,6 +171,11 @@ impl Studio {
 }
 
 impl Shot {
+    /// Points of the vessels at a phase, patient mm (LPS).
+    pub fn points_mm(&self, phase: usize) -> Vec<[f64; 3]> {
+        self.points[phase].iter().map(|point| lps_mm_from_world(*point).to_array()).collect()
+    }
+
     /// Writes `truth.json` into a directory.
     pub fn write_truth(&self, directory: &Path) {
         let frame = |f: &Frame| TrueFrame {

@@ -1,6 +1,6 @@
 //! Adjustment of views with the field of a fit in the loop: columns against f64 twins, planted errors of poses, whole adjustments.
 
-use crate::common::{gpu, run, tuning};
+use crate::common::{expect_silence, gpu, run, tuning};
 use crate::disagreeing::{PHASES, Shot, Studio, Wrong};
 use glam::DVec3;
 use nertca_vk::calibrate::correction::Calibration;
@@ -23,7 +23,10 @@ use nertca_vk::methods::dynamic_gaussians::targets::Targets;
 use nertca_vk::plan::Plan;
 use nertca_vk::reference::gaussians::{params, project};
 use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::session::{FrameTime, NewFrame, Progress, Session, SessionOptions, State};
 use nertca_vk::train::trainer::Trainer;
+use std::sync::{Arc, Condvar, Mutex};
+use std::time::Duration;
 
 const SIZE: usize = 64;
 
@@ -234,4 +237,104 @@ fn views_that_agree_are_not_adjusted() {
     let plan = Plan::new(&fast(), &after).unwrap();
     let trainer = Trainer::after_adjustment(&gpu, plan, &after, tuning(&gpu), Some(&other)).unwrap();
     assert!(trainer.preparation().is_some(), "the fit to other data is not taken over");
+}
+
+/// A session with the frames of a shot.
+pub fn session(gpu: &Gpu, shot: &Shot) -> Session {
+    let dataset = &shot.dataset;
+    let options = SessionOptions {
+        config: fast(),
+        phases: dataset.n_phases,
+        depth_half_extent_mm: 0.5 * (dataset.depth_range.1 - dataset.depth_range.0) * MM_PER_UNIT,
+        vessel_attenuation_per_mm: None,
+        still: false,
+        deterministic: true,
+    };
+    let session = Session::new(Some(gpu.clone()), Some(tuning(gpu)), options).unwrap();
+    for frame in dataset.training() {
+        let new = NewFrame {
+            geometry: dataset.views[frame.view].geometry.clone(),
+            moment: FrameTime::Phase(frame.phase),
+            split: frame.split,
+            width: dataset.width,
+            height: dataset.height,
+            integrals: frame.integrals.to_vec(),
+            mask: None,
+        };
+        session.add_frame(new).unwrap();
+    }
+    session
+}
+
+#[test]
+#[ignore = "long: tools/test --all"]
+fn a_session_adjusts_its_views_when_training_has_ended_and_trains_on() {
+    let gpu = gpu();
+    let wrong = Wrong { angle_deg: 0.2, shift_mm: 0.3, breathing_mm: 0.6, noise: 0.02, seed: 11 };
+    let shot = Studio::new(&gpu, 100, 1).shoot(3, false, wrong);
+    let session = session(&gpu, &shot);
+    let steps = Arc::new(Mutex::new(Vec::new()));
+    let seen = steps.clone();
+    let observe = move |progress: &Progress| {
+        seen.lock().unwrap().push(progress.loss.step);
+        true
+    };
+    session.start(Box::new(observe)).unwrap();
+    assert!(session.wait(Duration::from_secs(1800)), "training ends");
+    assert_eq!(session.state(), State::Finished);
+    let calibration = session.calibration().unwrap();
+    let record = calibration.adjustment.clone().unwrap();
+    let corrected = shot.dataset.corrected(&calibration).unwrap();
+    let (before, after) = (error_px(&shot, &shot.dataset), error_px(&shot, &corrected));
+    println!("{before:.3} px to {after:.3} px, {record:?}");
+    assert!(record.accepted && before > 0.5 && after < 0.5 * before, "{before} px to {after} px, {record:?}");
+    let steps = steps.lock().unwrap();
+    assert!(steps.windows(2).any(|pair| pair[1] < pair[0]), "training went on with the corrected views: {steps:?}");
+    assert_eq!(steps.last(), Some(&session.step()));
+    // The field that is shown belongs to the corrected views: their frames are taken in, and drawn where the frames show them.
+    let model = session.checkpoint().unwrap().model;
+    assert_eq!(model.step, fast().train.iterations);
+    assert!(session.corrected_frame(0).unwrap().view.is_some());
+    // Training that is started again has nothing left to do.
+    session.start(Box::new(|_| true)).unwrap();
+    assert!(session.wait(Duration::from_secs(1800)) && session.state() == State::Finished);
+    assert_eq!(session.checkpoint().unwrap().model.gaussians, model.gaussians);
+    expect_silence_of(session, gpu);
+}
+
+#[test]
+fn a_session_that_is_stopped_while_it_adjusts_keeps_its_reconstruction() {
+    let gpu = gpu();
+    let shot = Studio::new(&gpu, SIZE, 1).shoot(3, false, Wrong { seed: 11, ..Wrong::default() });
+    let session = Arc::new(session(&gpu, &shot));
+    let end = fast().train.iterations;
+    let reached = Arc::new((Mutex::new(false), Condvar::new()));
+    let tell = reached.clone();
+    let observe = move |progress: &Progress| {
+        *tell.0.lock().unwrap() |= progress.loss.step == end;
+        tell.1.notify_all();
+        true
+    };
+    session.start(Box::new(observe)).unwrap();
+    let at_end = reached.0.lock().unwrap();
+    let (at_end, out) = reached.1.wait_timeout_while(at_end, Duration::from_secs(900), |at_end| !*at_end).unwrap();
+    assert!(*at_end && !out.timed_out(), "training reaches its end");
+    drop(at_end);
+    session.stop().unwrap();
+    // The adjustment was stopped, had not begun, or was faster than this thread.
+    assert!(matches!(session.state(), State::Idle | State::Finished), "{:?}", session.state());
+    assert_eq!(session.checkpoint().unwrap().model.step, end);
+    // Views that agree are looked at once more, and stay as they are.
+    session.start(Box::new(|_| true)).unwrap();
+    assert!(session.wait(Duration::from_secs(900)) && session.state() == State::Finished);
+    let record = session.calibration().unwrap().adjustment.unwrap();
+    println!("{record:?}");
+    assert!(!record.accepted && record.misfit_after.is_none(), "{record:?}");
+    expect_silence_of(Arc::into_inner(session).unwrap(), gpu);
+}
+
+fn expect_silence_of(session: Session, gpu: Gpu) {
+    session.stop().unwrap();
+    drop(session);
+    expect_silence(gpu);
 }

@@ -34,6 +34,7 @@ mod refits;
 mod schedules;
 mod scoring;
 mod session_ends;
+mod session_prior;
 mod session_slices;
 mod soft_hull;
 mod subgroups;

@@ -9,9 +9,7 @@ use super::tree::{of_page as tree_of_page, remove_old as remove_old_tree, score 
 use clap::Args;
 use clap::error::ErrorKind;
 use nertca_vk::checkpoint::{self, newest_model};
-use nertca_vk::choice::Choice;
 use nertca_vk::config::Config;
-use nertca_vk::config::method::MethodKind;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::{self, Lock};
 use nertca_vk::formats::nrrd;
@@ -105,7 +103,7 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
         clap::Error::raw(ErrorKind::MissingRequiredArgument, NO_DATA).exit();
     };
     let mut dataset = Dataset::open(data)?;
-    let prior = prior(args, &config)?;
+    let prior = prior(args.prior.as_deref(), &config)?;
     let run = &args.out.clone().map_or_else(|| default_run(data), Ok)?;
     if let Some(file) = &args.export_hull {
         return export_hull(&config, &dataset, file);
@@ -212,12 +210,9 @@ fn resumed(run: &Path) -> Result<(Config, bool)> {
 }
 
 /// Reads the prior vessels that the command line names.
-fn prior(args: &TrainArgs, config: &Config) -> Result<Option<VesselPrior>> {
-    let Some(file) = &args.prior else { return Ok(None) };
-    if config.method() != MethodKind::DynamicGaussians {
-        let problem = format!("is used by the preset `fast` only, and the preset is `{}`", config.preset.name());
-        return Err(Error::config("--prior", file.display(), problem));
-    }
+pub fn prior(file: Option<&Path>, config: &Config) -> Result<Option<VesselPrior>> {
+    let Some(file) = file else { return Ok(None) };
+    config.takes_prior("--prior", &file.display().to_string())?;
     prior::read(file).map(Some)
 }
 

@@ -20,6 +20,7 @@ use nertca_vk::import::intake::StatedRun;
 use nertca_vk::import::stated::StatedGeometry;
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::scan::dataset::Split;
+use nertca_vk::scan::prior::VesselPrior;
 use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions, State};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -46,6 +47,9 @@ pub struct WatchArgs {
     /// Port of the viewer's page on 127.0.0.1; a free one by default.
     #[arg(long, default_value_t = 0)]
     pub port: u16,
+    /// Vessels that are known before, e.g. from a CT, as `train --prior` takes them.
+    #[arg(long, value_name = "FILE")]
+    pub prior: Option<PathBuf>,
     /// Options of reading runs.
     #[command(flatten)]
     pub reading: DicomArgs,
@@ -64,6 +68,7 @@ pub fn run(global: &GlobalOptions, args: &WatchArgs) -> Result<()> {
     let (config, options) = (args.config.load([])?, args.reading.options()?);
     // Runs come in an order that nobody knows, so what is stated is stated of all.
     let stated = args.reading.stated(1)?.remove(0);
+    let prior = super::train::prior(args.prior.as_deref(), &config)?;
     let mut folder = Folder::new(&args.directory);
     folder.look()?;
     let _lock = prepare(&args.out)?;
@@ -87,6 +92,7 @@ pub fn run(global: &GlobalOptions, args: &WatchArgs) -> Result<()> {
         gpu: &gpu,
         tuning,
         config,
+        prior,
         options,
         stated,
         intake,
@@ -116,6 +122,8 @@ struct Watch<'a> {
     gpu: &'a Gpu,
     tuning: Tuning,
     config: Config,
+    /// Vessels that are known before.
+    prior: Option<VesselPrior>,
     options: ImportOptions,
     stated: StatedRun,
     intake: Intake,
@@ -261,6 +269,7 @@ impl Watch<'_> {
                     deterministic: false,
                 };
                 let session = Session::new(Some(self.gpu.clone()), Some(self.tuning.clone()), options)?;
+                session.set_prior(self.prior.clone())?;
                 (0..=newest).try_for_each(|run| self.add(&session, run))?;
                 session.start(Box::new(|_| true))?;
                 self.under_way = Some(UnderWay { session: Arc::new(session), runs: 0 });
@@ -320,6 +329,9 @@ impl Watch<'_> {
         };
         if let Some(error) = nothing {
             eprintln!("the earlier reconstruction is written: {error}");
+        }
+        if let Some(prior) = &self.prior {
+            prior.write(run)?;
         }
         let saved = kept.leave(&self.intake, (self.gpu, &self.tuning), run)?;
         eprintln!("{} of {} iterations", kept.step(), self.config.train.iterations);

@@ -45,6 +45,8 @@ struct Stage {
 /// Broad Gaussians first: their images still overlap those of the vessels when poses are far off.
 const STAGES: [Stage; 2] =
     [Stage { min_scale: 1.2, count: 120, cycles: 2 }, Stage { min_scale: 0.8, count: 250, cycles: 3 }];
+/// Maximum number of cycles.
+const N_CYCLES: u32 = STAGES[0].cycles + STAGES[1].cycles;
 /// Factor on the change of the poses in a cycle, except in the last one: a field holds back part of the change.
 const FARTHER: f64 = 1.6;
 /// Change of the poses in a cycle, pixels, below which a stage is over.
@@ -114,7 +116,7 @@ impl Adjuster<'_> {
     /// Adjusts the poses of a calibrated dataset.
     fn run(&self, calibrated: &Dataset, start: Poses, observe: &mut Observe<'_>) -> Result<Option<AdjustedFit>> {
         observe(0.0)?;
-        let Some((before, made)) = self.compared(calibrated)? else { return Ok(None) };
+        let Some((before, made)) = self.compared(calibrated, &mut || observe(0.0))? else { return Ok(None) };
         let outcome = |poses: Poses, accepted: bool, after: Option<f64>, made: MadeGaussians| {
             let record = Adjustment { accepted, misfit_before: before, misfit_after: after };
             let adjusted = Adjusted { views: self.stands.views.clone(), poses, record };
@@ -124,7 +126,8 @@ impl Adjuster<'_> {
             return outcome(start, false, None, made);
         }
         let Some(poses) = self.found(start, observe)? else { return Ok(None) };
-        match self.compared(&self.as_in_a_run(&poses)?)? {
+        let nearly = f64::from(N_CYCLES + 1) / f64::from(N_CYCLES + 2);
+        match self.compared(&self.as_in_a_run(&poses)?, &mut || observe(nearly))? {
             Some((after, adjusted)) if after <= ACCEPTED * before => outcome(poses, true, Some(after), adjusted),
             after => outcome(poses, false, after.map(|(after, _)| after), made),
         }
@@ -132,18 +135,17 @@ impl Adjuster<'_> {
 
     /// Finds poses in cycles of a fit and a step of the poses.
     fn found(&self, start: Poses, observe: &mut Observe<'_>) -> Result<Option<Poses>> {
-        let n_cycles: u32 = STAGES.iter().map(|stage| stage.cycles).sum();
         let (mut poses, mut number) = (start, 0);
         for stage in &STAGES {
             let end = number + stage.cycles;
             while number < end {
                 number += 1;
                 // The fits before and after the cycles count as well.
-                observe(f64::from(number) / f64::from(n_cycles + 2))?;
+                let share = f64::from(number) / f64::from(N_CYCLES + 2);
                 let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
                 let config = stage.config(self.config, seed);
-                let Some(fit) = self.fit(&self.stands.at(&poses), &config, Pruning::Off)? else { return Ok(None) };
-                let trainer = fit.trainer;
+                let fit = self.fit(&self.stands.at(&poses), &config, Pruning::Off, &mut || observe(share))?;
+                let Some(Fitted { trainer, .. }) = fit else { return Ok(None) };
                 let mut next = poses.clone();
                 let mut field = FieldInLoop::new(&trainer, &self.stands);
                 for _ in 0..STEPS {
@@ -151,14 +153,13 @@ impl Adjuster<'_> {
                 }
                 let change_px = self.stands.change_px(trainer.targets(), &poses, &next);
                 tracing::debug!("cycle {number} of the adjustment: {} Gaussians, {change_px:.3} px", trainer.count());
-                poses = extrapolated(&poses, &next, if number < n_cycles { FARTHER } else { 1.0 });
+                poses = extrapolated(&poses, &next, if number < N_CYCLES { FARTHER } else { 1.0 });
                 if change_px < SETTLED_PX {
                     break;
                 }
             }
             number = end;
         }
-        observe(f64::from(n_cycles + 1) / f64::from(n_cycles + 2))?;
         Ok(Some(poses))
     }
 
@@ -178,18 +179,28 @@ impl Adjuster<'_> {
     }
 
     /// Fits with the settings of the run; returns the misfit and the fit.
-    fn compared(&self, dataset: &Dataset) -> Result<Option<(f64, MadeGaussians)>> {
-        let Some(Fitted { mut trainer, losses, fingerprint }) = self.fit(dataset, self.config, Pruning::On)? else {
-            return Ok(None);
-        };
+    fn compared(
+        &self,
+        dataset: &Dataset,
+        proceed: &mut dyn FnMut() -> Result<()>,
+    ) -> Result<Option<(f64, MadeGaussians)>> {
+        let fit = self.fit(dataset, self.config, Pruning::On, proceed)?;
+        let Some(Fitted { mut trainer, losses, fingerprint }) = fit else { return Ok(None) };
         let gaussians = DynamicGaussians::Deformable(trainer.deformable()?);
         let misfit = misfit(trainer.targets(), &trainer.images()?);
         let findings = trainer.take_catheter().into_iter().collect();
         Ok(Some((misfit, MadeGaussians { gaussians, losses, findings, fingerprint })))
     }
 
-    /// Fits a deformable set; none where the data do not ask for one.
-    fn fit(&self, dataset: &Dataset, config: &Config, pruning: Pruning) -> Result<Option<Fitted>> {
+    /// Fits a deformable set; none where the data do not ask for one. `proceed` is called before every few iterations.
+    fn fit(
+        &self,
+        dataset: &Dataset,
+        config: &Config,
+        pruning: Pruning,
+        proceed: &mut dyn FnMut() -> Result<()>,
+    ) -> Result<Option<Fitted>> {
+        proceed()?;
         let half = dynamic_half(config, dataset);
         let motion = SoftMotion::carved(self.evidence.clone(), dataset, half, SOFT_HULL_CELLS);
         let targets = match Targets::new(dataset, &motion, &config.gaussians) {
@@ -207,6 +218,7 @@ impl Adjuster<'_> {
         }
         let mut losses = Vec::new();
         while trainer.step() < config.gaussians.iterations {
+            proceed()?;
             losses.extend(trainer.advance(config.gaussians.iterations)?);
         }
         Ok(Some(Fitted { trainer, losses, fingerprint }))

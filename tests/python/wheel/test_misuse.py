@@ -182,6 +182,15 @@ def test_r_peaks_that_cannot_be(context: Context, times: Any) -> None:
         made.set_r_peaks(times)
 
 
+@pytest.mark.parametrize("points", [[1.0, 2.0, 3.0], [[1.0, 2.0]], [[0.0, 0.0, NAN]], [["a", "b", "c"]], None])
+def test_priors_that_cannot_be(points: Any) -> None:
+    with nertca_vk.Context(device="none") as bare, nertca_vk.Reconstruction(3, context=bare) as made:
+        made.set_prior([[0.0, 1.0, 2.0], [0.0, 1.0, 3.0]])
+        made.set_prior([])
+        with pytest.raises(ArgumentError):
+            made.set_prior(points)
+
+
 def test_options_that_cannot_be(context: Context) -> None:
     for options in (
         {"phases": 0},

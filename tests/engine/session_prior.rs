@@ -1,0 +1,42 @@
+//! Vessels that are known before, in a session: its fits are those of a run with the same prior.
+
+use crate::adjustment::session;
+use crate::common::{expect_silence, gpu, run, tuning};
+use crate::disagreeing::{Studio, Wrong};
+use nertca_vk::calibrate::calibrate;
+use nertca_vk::config::{Config, Preset};
+use nertca_vk::gaussians::field::DynamicGaussians;
+use nertca_vk::plan::Plan;
+use nertca_vk::scan::prior::VesselPrior;
+use nertca_vk::train::trainer::Trainer;
+use std::sync::Arc;
+
+#[test]
+fn a_session_fits_as_a_run_with_the_same_prior() {
+    const ITERATIONS: u32 = 10;
+    let gpu = gpu();
+    let shot = Studio::new(&gpu, 64, 1).shoot(3, false, Wrong::default());
+    let prior = VesselPrior { shapes_mm: vec![shot.points_mm(0)] };
+    let of_session = |prior: Option<VesselPrior>| -> DynamicGaussians {
+        let session = session(&gpu, &shot);
+        session.set_prior(prior).unwrap();
+        assert_eq!(session.train(ITERATIONS, &mut |_| true).unwrap(), ITERATIONS);
+        let gaussians = session.checkpoint().unwrap().model.gaussians;
+        session.stop().unwrap();
+        gaussians.unwrap()
+    };
+    let of_run = |prior: VesselPrior| -> DynamicGaussians {
+        let mut config = Config::preset(Preset::Fast);
+        config.gaussians.fits = 1;
+        let mut dataset = shot.dataset.clone();
+        dataset.prior = Some(Arc::new(prior));
+        let dataset = dataset.corrected(&calibrate(&dataset, &config).unwrap()).unwrap();
+        let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+        run(&mut trainer, ITERATIONS);
+        trainer.model().unwrap().gaussians.unwrap()
+    };
+    let with = of_session(Some(prior.clone()));
+    assert_eq!(with, of_run(prior));
+    assert_ne!(with, of_session(None), "the prior changes the seeds");
+    expect_silence(gpu);
+}
