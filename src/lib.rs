@@ -219,6 +219,7 @@ pub mod export {
     #[cfg(feature = "dicom")]
     pub mod dicom;
     pub mod motion;
+    pub mod splats;
     pub mod surfaces;
     pub mod volumes;
 }

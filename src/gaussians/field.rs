@@ -112,7 +112,7 @@ const BELOW_VESSELS: f64 = 0.75;
 
 /// Returns the density of the vessels: three quarters of the attenuation are in less dense Gaussians, such as the ends, the
 /// walls and the thin branches of vessels, and other moving structures.
-pub(super) fn vessel_density(rows: &[Gaussian], setup: &GaussianSetup) -> f64 {
+pub fn vessel_density(rows: &[Gaussian], setup: &GaussianSetup) -> f64 {
     let mut by_density: Vec<(f64, f64)> = rows.iter().map(|g| (density(g), mass(g, setup))).collect();
     by_density.sort_by(|a, b| a.0.total_cmp(&b.0));
     let all: f64 = by_density.iter().map(|(_, mass)| mass).sum();
@@ -126,7 +126,8 @@ pub(super) fn vessel_density(rows: &[Gaussian], setup: &GaussianSetup) -> f64 {
     0.0
 }
 
-fn density(g: &Gaussian) -> f64 {
+/// Returns the attenuation at a Gaussian's centre, in the units of the set.
+pub fn density(g: &Gaussian) -> f64 {
     f64::from(g.log_density).exp()
 }
 

@@ -308,6 +308,33 @@ fn motion_opens_in_other_tools() {
 }
 
 #[test]
+fn splats_open_in_other_tools() {
+    let dir = tempfile::tempdir().unwrap();
+    let to = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
+    let run = saved(moving_model(), &dir.path().join("tree.safetensors"));
+    assert_eq!(ok(&["export", &run, "--splats", "--out", &to("beat.ply")]).lines().count(), PHASES);
+    ok(&["export", &run, "--spacing", "2", "--out", &to("beat.nrrd")]);
+    let densities: Vec<f64> = (0..6).map(|i| (-1.0 + 0.1 * f64::from(i)).exp()).collect();
+    let expected = json!({
+        "attenuation_per_mm":
+            densities.iter().map(|d| d * UNITS.strongest / (UNITS.pixel * 100.0)).collect::<Vec<_>>(),
+        "rest_phase": REST,
+        "places_mm": (0..6).map(|i| lps_mm(rest(i))).collect::<Vec<_>>(),
+    });
+    std::fs::write(to("expected.json"), expected.to_string()).unwrap();
+    let script = crate::root::root().join("tests/python/check_splats.py");
+    let outcome = python().arg(script).arg(dir.path()).output().unwrap();
+    assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
+    // One phase is one file of the given name.
+    assert_eq!(ok(&["export", &run, "--splats", "--phase", "2", "--out", &to("one.ply")]).trim(), to("one.ply"));
+    assert_eq!(std::fs::read(to("one.ply")).unwrap(), std::fs::read(to("beat_0002.ply")).unwrap());
+    let network = saved(model("fast-mlp", None), &dir.path().join("network.safetensors"));
+    refuses(&["export", &network, "--splats", "--out", &to("x.ply")], &["network", "--mesh"]);
+    refuses(&["export", &run, "--splats", "--out", &to("x.obj")], &["x.obj", ".ply"]);
+    refuses(&["export", &run, "--splats", "--out", &to("beat.ply")], &["--force"]);
+}
+
+#[test]
 fn motion_that_is_not_known_is_not_exported() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("x.nrrd");

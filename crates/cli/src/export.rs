@@ -8,6 +8,7 @@ use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::export::motion::{MotionExport, MotionFormat, deformable_set, write_trajectories};
+use nertca_vk::export::splats::write_splats;
 use nertca_vk::export::surfaces::{MeshFormat, write_meshes};
 use nertca_vk::export::volumes::{Compression, Format, VolumeExport, grid_over};
 use nertca_vk::formats::nrrd::Encoding;
@@ -55,10 +56,14 @@ pub struct ExportArgs {
     /// With --motion: write the path of each Gaussian over the beat, including its own motion, as lines in a .vtk.
     #[arg(long, requires = "motion", conflicts_with_all = ["compress", "phase"])]
     pub trajectories: bool,
+    /// Export the Gaussians of the dynamic field for splat viewers (SuperSplat, gsplat and others): --out ends in .ply, one file per
+    /// phase, LPS mm. Opacity is the density as a share of that of the vessels.
+    #[arg(long, conflicts_with_all = ["mesh", "motion", "format", "component", "spacing", "compress"])]
+    pub splats: bool,
     /// Replace the files of an earlier series (`NAME_0000.EXT` and so on), all of them.
     #[arg(short, long)]
     pub force: bool,
-    /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .nii.gz, .mha, .npy or .vtk.
+    /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .nii.gz, .mha, .npy or .vtk; .ply with --splats.
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
 }
@@ -99,6 +104,9 @@ pub fn export(global: &GlobalOptions, args: &ExportArgs) -> Result<()> {
     let (phases, all) = phases(&args.phase, &model)?;
     if args.motion {
         return export_motion(args, &model, phases, all);
+    }
+    if args.splats {
+        return export_splats(args, &model, &phases);
     }
     if args.mesh && args.component.has_static() {
         return Err(Error::config(
@@ -155,6 +163,18 @@ pub fn export(global: &GlobalOptions, args: &ExportArgs) -> Result<()> {
 /// Files of an earlier series in the way of an export that writes one file per phase.
 fn earlier(args: &ExportArgs, several: bool) -> Result<Earlier> {
     if several { Earlier::series(&args.out, args.force) } else { Ok(Earlier::none()) }
+}
+
+/// Exports Gaussians; needs no device.
+fn export_splats(args: &ExportArgs, model: &Model, phases: &[u32]) -> Result<()> {
+    if !args.out.extension().is_some_and(|end| end.eq_ignore_ascii_case("ply")) {
+        return Err(Error::config("--out", args.out.display(), "does not end in .ply"));
+    }
+    let earlier = earlier(args, phases.len() > 1)?;
+    let made = write_splats(model, phases, &args.out)?;
+    earlier.make_way(&made)?;
+    made.iter().for_each(|path| out!("{}", path.display()));
+    Ok(())
 }
 
 /// Exports displacements, or the paths of the Gaussians; needs no device.

@@ -26,6 +26,7 @@ pub mod nrrd;
 pub mod png;
 pub mod raster;
 pub mod raw;
+pub mod splats;
 pub mod swc;
 pub mod volume;
 pub mod volume_files;
