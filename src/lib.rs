@@ -244,6 +244,7 @@ pub mod trees {
     mod radii;
     mod refine;
     mod sampled;
+    pub mod sight;
     mod solid;
     mod tidy;
     pub mod tree;

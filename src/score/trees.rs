@@ -312,7 +312,14 @@ mod tests {
         let branch =
             |phase| Branch { parent: None, points_mm: line(phase), radius_mm: vec![1.0; 3], agreement: Vec::new() };
         let phases = (0..4).map(|phase| PhaseTree { phase, branches: vec![branch(phase)] }).collect();
-        BeatTree { reference_phase, threshold_per_mm: 0.1, resolution_mm: 1.0, spacing_mm: 1.0, phases }
+        BeatTree {
+            reference_phase,
+            threshold_per_mm: 0.1,
+            resolution_mm: 1.0,
+            spacing_mm: 1.0,
+            views: Vec::new(),
+            phases,
+        }
     }
 
     #[test]

@@ -86,6 +86,7 @@ pub fn vessel_trees(
         threshold_per_mm: finder.threshold_per_mm,
         resolution_mm: finder.resolution_mm,
         spacing_mm: finder.spacing_mm,
+        views: Vec::new(),
         phases,
     })
 }

@@ -5,7 +5,8 @@ use crate::files;
 use crate::formats::swc;
 use crate::formats::vtp::{self, Values};
 use crate::trees::lesions::{Lesion, lesions};
-use crate::trees::tree::{BeatTree, Branch, PhaseTree};
+use crate::trees::sight::TreeInView;
+use crate::trees::tree::{BeatTree, Branch, PhaseTree, TreeView};
 use crate::trees::tubes::to_glb;
 use glam::DVec3;
 use serde::Serialize;
@@ -75,11 +76,34 @@ struct LesionRow {
     min_diameter_mm: f64,
     reference_diameter_mm: f64,
     stenosis_percent: f64,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    views: Vec<SightRow>,
+}
+
+/// Sight of a lesion in a training view.
+#[derive(Serialize)]
+struct SightRow {
+    view: usize,
+    primary_deg: Option<f64>,
+    secondary_deg: Option<f64>,
+    foreshortening: f64,
+    overlap: f64,
 }
 
 impl LesionRow {
-    fn of(lesion: Lesion) -> LesionRow {
+    fn of(lesion: Lesion, tree: &PhaseTree, views: &[(&TreeView, TreeInView)]) -> LesionRow {
+        let sight = |(view, shown): &(&TreeView, TreeInView)| {
+            let sight = shown.sight(tree, &lesion.places)?;
+            Some(SightRow {
+                view: view.view,
+                primary_deg: view.angles_deg.map(|angles| angles.0),
+                secondary_deg: view.angles_deg.map(|angles| angles.1),
+                foreshortening: rounded(sight.foreshortening),
+                overlap: rounded(sight.overlap),
+            })
+        };
         LesionRow {
+            views: views.iter().filter_map(sight).collect(),
             stenosis_percent: (10.0 * lesion.percent()).round() / 10.0,
             branch: lesion.branch,
             point: lesion.point,
@@ -192,11 +216,16 @@ fn write_phases(
 /// # Errors
 /// [`Error::Internal`] for values that JSON cannot represent.
 pub fn to_json(beat: &BeatTree) -> Result<String> {
-    let phases = beat.phases.iter().map(|tree| PhaseRow {
-        phase: tree.phase,
-        length_mm: rounded(tree.length_mm()),
-        branches: tree.branches.iter().map(BranchRow::of).collect(),
-        lesions: lesions(tree, beat.resolution_mm).into_iter().map(LesionRow::of).collect(),
+    let phases = beat.phases.iter().map(|tree| {
+        let found = lesions(tree, beat.resolution_mm);
+        // Views are needed for lesions only.
+        let views = if found.is_empty() { Vec::new() } else { in_views(beat, tree) };
+        PhaseRow {
+            phase: tree.phase,
+            length_mm: rounded(tree.length_mm()),
+            branches: tree.branches.iter().map(BranchRow::of).collect(),
+            lesions: found.into_iter().map(|lesion| LesionRow::of(lesion, tree, &views)).collect(),
+        }
     });
     let file = TreeFile {
         format: FORMAT,
@@ -211,6 +240,11 @@ pub fn to_json(beat: &BeatTree) -> Result<String> {
         phases: phases.collect(),
     };
     serde_json::to_string(&file).map_err(|e| Error::Internal(e.to_string()))
+}
+
+/// Returns a tree as each training view shows it.
+fn in_views<'a>(beat: &'a BeatTree, tree: &PhaseTree) -> Vec<(&'a TreeView, TreeInView)> {
+    beat.views.iter().map(|view| (view, TreeInView::new(tree, &view.rays, beat.resolution_mm))).collect()
 }
 
 fn title(beat: &BeatTree, tree: &PhaseTree) -> String {
@@ -285,7 +319,14 @@ mod tests {
             Branch { parent: Some(0), points_mm: line(&[1.0, 5.0]), radius_mm: vec![1.5, 0.7], agreement: Vec::new() },
         ];
         let phases = vec![PhaseTree { phase: 3, branches }];
-        BeatTree { reference_phase, threshold_per_mm: 0.02, resolution_mm: 0.5, spacing_mm: 0.25, phases }
+        BeatTree {
+            reference_phase,
+            threshold_per_mm: 0.02,
+            resolution_mm: 0.5,
+            spacing_mm: 0.25,
+            views: Vec::new(),
+            phases,
+        }
     }
 
     #[test]

@@ -45,6 +45,8 @@ pub struct Lesion {
     pub min_diameter_mm: f64,
     /// Reference diameter there, mm.
     pub reference_diameter_mm: f64,
+    /// Points of the narrowed part, as branch and point.
+    pub places: Vec<(usize, usize)>,
 }
 
 impl Lesion {
@@ -52,6 +54,21 @@ impl Lesion {
     pub fn percent(&self) -> f64 {
         100.0 * (1.0 - self.min_diameter_mm / self.reference_diameter_mm)
     }
+}
+
+/// A vessel with its diameters, straightened: it continues through bifurcations.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StraightVessel {
+    /// Branch and point of each place.
+    pub places: Vec<(usize, usize)>,
+    /// Length along the vessels from the root of the tree to each place, mm.
+    pub along_mm: Vec<f64>,
+    /// Diameter at each place without the field's blur along the vessel, mm.
+    pub diameter_mm: Vec<f64>,
+    /// Reference diameter at each place, mm.
+    pub reference_mm: Vec<f64>,
+    /// Stenoses of the vessel.
+    pub lesions: Vec<Lesion>,
 }
 
 /// A vessel that continues through bifurcations, as points of the branches that it consists of.
@@ -71,7 +88,13 @@ struct Course {
 /// nowhere as wide on one of the sides, the reference is the greatest radius of that side. A lesion is a part
 /// whose diameter is below nine tenths of the reference, and somewhere [`MIN_PERCENT`] or more below it.
 pub fn lesions(tree: &PhaseTree, resolution_mm: f64) -> Vec<Lesion> {
-    courses(tree).iter().flat_map(|course| course.lesions(resolution_mm)).collect()
+    straight_vessels(tree, resolution_mm).into_iter().flat_map(|vessel| vessel.lesions).collect()
+}
+
+/// Returns the vessels of a tree with their diameters and stenoses, as [`lesions`] judges them; vessels that are too short to be judged are
+/// left out.
+pub fn straight_vessels(tree: &PhaseTree, resolution_mm: f64) -> Vec<StraightVessel> {
+    courses(tree).into_iter().filter_map(|course| course.judged(resolution_mm)).collect()
 }
 
 /// Joins the branches of a tree to courses. Each branch belongs to one.
@@ -138,15 +161,15 @@ impl Course {
         along_mm
     }
 
-    fn lesions(&self, resolution_mm: f64) -> Vec<Lesion> {
+    fn judged(self, resolution_mm: f64) -> Option<StraightVessel> {
         let n = self.places.len();
         if n < 3 {
-            return Vec::new();
+            return None;
         }
         let (start_mm, end_mm) = (self.along_mm[0], self.along_mm[n - 1]);
         let step_mm = (end_mm - start_mm) / (n - 1) as f64;
         let radius_mm = sharpened(&self.radius_mm, BLUR * resolution_mm / step_mm);
-        let Some(smooth_mm) = reference(&radius_mm, step_mm) else { return Vec::new() };
+        let smooth_mm = reference(&radius_mm, step_mm)?;
         // A vessel that becomes narrower and stays so, as behind a bifurcation, has no stenosis.
         let whole_mm = recovered(&radius_mm, (BESIDE * resolution_mm / step_mm).ceil() as usize);
         let reference_mm: Vec<f64> = smooth_mm.iter().zip(&whole_mm).map(|(a, b)| a.min(*b)).collect();
@@ -172,11 +195,19 @@ impl Course {
                     length_mm,
                     min_diameter_mm: 2.0 * radius_mm[worst],
                     reference_diameter_mm: 2.0 * reference_mm[worst],
+                    places: self.places[first..=last].to_vec(),
                 });
             }
             first = last + 1;
         }
-        found
+        let doubled = |radii: Vec<f64>| radii.into_iter().map(|radius| 2.0 * radius).collect();
+        Some(StraightVessel {
+            diameter_mm: doubled(radius_mm),
+            reference_mm: doubled(reference_mm),
+            lesions: found,
+            places: self.places,
+            along_mm: self.along_mm,
+        })
     }
 }
 

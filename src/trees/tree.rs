@@ -1,5 +1,7 @@
 //! Vessels as a tree of centrelines with radii, at one phase or followed over the beat; patient coordinates, LPS mm.
 
+use crate::geometry::ViewRays;
+use crate::scan::dataset::Dataset;
 use glam::DVec3;
 
 /// Share of the other fits below which a place is doubtful. With two views, 50 to 90 % of the places that nearly all fits have are true,
@@ -86,6 +88,29 @@ impl PhaseTree {
     }
 }
 
+/// A training view of a tree.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TreeView {
+    /// Index of the view in the dataset.
+    pub view: usize,
+    /// Primary and secondary angle, degrees, where the geometry is stated by angles.
+    pub angles_deg: Option<(f64, f64)>,
+    /// Rays as calibrated.
+    pub rays: ViewRays,
+}
+
+impl TreeView {
+    /// Returns the training views of a dataset.
+    pub fn of(dataset: &Dataset) -> Vec<TreeView> {
+        let of_view = |view: usize| TreeView {
+            view,
+            angles_deg: dataset.views[view].geometry.angles_deg(),
+            rays: dataset.views[view].rays.clone(),
+        };
+        dataset.training_views().into_iter().map(of_view).collect()
+    }
+}
+
 /// Vessels over the beat.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BeatTree {
@@ -98,6 +123,8 @@ pub struct BeatTree {
     pub resolution_mm: f64,
     /// Grid step at which the field was sampled, mm; the maximum over all phases.
     pub spacing_mm: f64,
+    /// Training views, in which the sight of stenoses is stated; empty where they are not known.
+    pub views: Vec<TreeView>,
     /// Phases, in the order of the request.
     pub phases: Vec<PhaseTree>,
 }

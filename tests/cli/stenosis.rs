@@ -29,6 +29,37 @@ fn lesions_of(directory: &Path, more: &[&str]) -> (Value, Value, String) {
     (read(&at("data/truth.json")), read(&at("tree.json"))["phases"][0].clone(), said)
 }
 
+/// Compares the foreshortening of a lesion in each view with that of its points along the C-arm's axis.
+#[track_caller]
+fn expect_foreshortening(tree: &Value, lesion: &Value) {
+    let index = |field: &str| lesion[field].as_u64().unwrap() as usize;
+    let points: Vec<[f64; 3]> = serde_json::from_value(tree["branches"][index("branch")]["points_mm"].clone()).unwrap();
+    let part = &points[index("point") - 2..index("point") + 3];
+    let views = lesion["views"].as_array().unwrap();
+    assert_eq!(views.len(), 4, "{lesion}");
+    let mut shares = Vec::new();
+    for view in views {
+        let angle = |field: &str| view[field].as_f64().unwrap().to_radians();
+        let (primary, secondary) = (angle("primary_deg"), angle("secondary_deg"));
+        // LAO turns the detector to the patient's left, CRA to the head (left, posterior, superior).
+        let axis = [secondary.cos() * primary.sin(), -secondary.cos() * primary.cos(), secondary.sin()];
+        let (mut length, mut shown) = (0.0, 0.0);
+        for pair in part.windows(2) {
+            let step: Vec<f64> = (0..3).map(|k| pair[1][k] - pair[0][k]).collect();
+            let along: f64 = (0..3).map(|k| step[k] * axis[k]).sum();
+            let squared: f64 = step.iter().map(|v| v * v).sum();
+            length += squared.sqrt();
+            shown += (squared - along * along).max(0.0).sqrt();
+        }
+        let share = view["foreshortening"].as_f64().unwrap();
+        assert!((share - (1.0 - shown / length)).abs() < 0.08, "{view}: {}", 1.0 - shown / length);
+        assert!((0.0..=1.0).contains(&view["overlap"].as_f64().unwrap()), "{view}");
+        shares.push(share);
+    }
+    let (least, most) = shares.iter().fold((1.0f64, 0.0f64), |(a, b), share| (a.min(*share), b.max(*share)));
+    assert!(most > least + 0.1, "views differ, so that the comparison means something: {shares:?}");
+}
+
 #[test]
 fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
     let directory = tempfile::tempdir().unwrap();
@@ -44,7 +75,9 @@ fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
     assert!(off("from_root_mm", "from_ostium_mm") < 3.0, "{lesion}, {true_lesion}");
     assert!(said.contains("phase 0: stenosis of "), "{said}");
     let page = std::fs::read_to_string(ill.join("run/report.html")).unwrap();
-    assert!(page.contains("stenosis, %"), "the report has a table of stenoses");
+    assert!(page.contains("stenosis, %") && page.contains("view 3, %"), "the report has a table of stenoses");
+    assert!(page.contains("class=\"strip\"") && page.contains("#d0342c"), "the report has the vessel straightened");
+    expect_foreshortening(&tree, lesion);
 
     let (truth, tree, said) = lesions_of(&healthy, &[]);
     assert!(truth.get("lesions").is_none(), "a truth without lesions has no such field");

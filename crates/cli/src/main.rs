@@ -31,6 +31,7 @@ mod frame_rates;
 mod geometry_picture;
 mod info;
 mod kernels;
+mod lesion_section;
 mod lettering;
 mod memory;
 mod options;

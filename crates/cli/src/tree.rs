@@ -10,13 +10,15 @@ use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::model::Model;
 use nertca_vk::render::renderer::Renderer;
+use nertca_vk::run::info::RunInfo;
+use nertca_vk::run::score::as_trained;
 use nertca_vk::run::tree_score::score_tree;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::Evaluation;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
 use nertca_vk::trees::lesions::{Lesion, lesions};
-use nertca_vk::trees::tree::{BeatTree, DOUBTFUL};
+use nertca_vk::trees::tree::{BeatTree, DOUBTFUL, TreeView};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -51,12 +53,12 @@ pub struct TreeArgs {
 /// File in the run directory with the tree that the run's page shows.
 const TREE_FILE: &str = "tree.json";
 
-/// Finds the tree of all phases of a model for a run's page, and writes it to a file beside the page. If the model has no
+/// Finds the tree of all phases of a model for a run's page, with the training views of the dataset, and writes it to a file beside the page. If the model has no
 /// vessels or the file cannot be written, a warning is added.
 pub fn of_page(
     global: &GlobalOptions,
-    gpu: &Gpu,
-    model: &Model,
+    (gpu, model): (&Gpu, &Model),
+    dataset: &Dataset,
     cancel: &AtomicBool,
     directory: &Path,
     warnings: &mut Vec<String>,
@@ -64,7 +66,8 @@ pub fn of_page(
     let phases = (0..model.shown_phases()).collect();
     let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };
     match find(global, gpu, model, cancel, &options) {
-        Ok(beat) => {
+        Ok(mut beat) => {
+            beat.views = TreeView::of(dataset);
             leave(&beat, directory, warnings)?;
             Ok(Some(beat))
         }
@@ -142,6 +145,18 @@ fn in_words(lesion: &Lesion) -> String {
     )
 }
 
+/// Returns the training views of a run as it was calibrated; says so where they are not known.
+fn training_views(run: &Path) -> Vec<TreeView> {
+    let directory = if run.is_dir() { run } else { run.parent().unwrap_or(Path::new("")) };
+    let views = RunInfo::read(run)
+        .and_then(|info| as_trained(Dataset::open(&info.dataset)?, directory))
+        .map(|dataset| TreeView::of(&dataset));
+    views.unwrap_or_else(|error| {
+        eprintln!("the sight of stenoses in the training views is not stated: {error}");
+        Vec::new()
+    })
+}
+
 /// Finds the vessels of a run as trees and writes them.
 pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     let unknown = || Error::config("--out", args.out.display(), "does not end in one of .json .vtp .swc .glb");
@@ -153,7 +168,8 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     let gpu = global.open_device()?;
     let options = TreeOptions { phases, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
     // Ctrl-C may end the program at once, because no partial result has been written here.
-    let beat = find(global, &gpu, &model, &AtomicBool::new(false), &options)?;
+    let mut beat = find(global, &gpu, &model, &AtomicBool::new(false), &options)?;
+    beat.views = training_views(&args.run);
     let made = write(&beat, &args.out, format, all)?;
     earlier.make_way(&made)?;
     made.iter().for_each(|path| out!("{}", path.display()));

@@ -1,6 +1,7 @@
 //! The vessel tree on a run's page: lines over the angiograms it was reconstructed from, with lengths and diameters of its
 //! branches. It is the only part of the page that needs a script, which is embedded.
 
+use super::lesion_section;
 use super::view_server::TREES_SCRIPT;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -11,8 +12,7 @@ use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk::scan::gating::SYSTOLE_SHARE;
 use nertca_vk::score::pictures::Window;
 use nertca_vk::trees::files::{note, to_json};
-use nertca_vk::trees::lesions::{Lesion, MIN_PERCENT, lesions};
-use nertca_vk::trees::tree::{BeatTree, DOUBTFUL, PhaseTree};
+use nertca_vk::trees::tree::{BeatTree, DOUBTFUL, PhaseTree, TreeView};
 use serde_json::{Value, json};
 
 const SCRIPT: &str = include_str!("report_trees.js");
@@ -31,8 +31,8 @@ pub struct TreeSection {
     note: &'static str,
     /// Names of the phases with tables, and their trees.
     tables: Vec<(&'static str, PhaseTree)>,
-    /// Resolution of the field, mm.
-    resolution_mm: f64,
+    /// Tree with the training views.
+    beat: BeatTree,
 }
 
 impl TreeSection {
@@ -50,11 +50,12 @@ impl TreeSection {
         let named = |(name, phase): (&'static str, u32)| {
             beat.phases.iter().find(|tree| tree.phase == phase).map(|tree| (name, tree.clone()))
         };
+        let beat = BeatTree { views: TreeView::of(dataset), ..beat.clone() };
         Ok(TreeSection {
-            data: format!(r#"{{"tree":{},"views":{views}}}"#, to_json(beat)?),
-            note: note(beat),
+            data: format!(r#"{{"tree":{},"views":{views}}}"#, to_json(&beat)?),
+            note: note(&beat),
             tables: names.into_iter().filter_map(named).collect(),
-            resolution_mm: beat.resolution_mm,
+            beat,
         })
     }
 
@@ -73,7 +74,7 @@ impl TreeSection {
             }
             p #tree-told role="status" {}
             div.by-view #tree-views {}
-            div.by-view { @for (name, tree) in &self.tables { (table(name, tree, self.resolution_mm)) } }
+            div.by-view { @for (name, tree) in &self.tables { (table(&self.beat, name, tree)) } }
             // The data contain only numbers, angles and base64 images, so that nothing in them can close the element.
             script #tree-data type="application/json" { (PreEscaped(&self.data)) }
             script { (PreEscaped(TREES_SCRIPT)) (PreEscaped(SCRIPT)) }
@@ -116,7 +117,7 @@ fn view_data(dataset: &Dataset, view: usize, step: usize) -> Result<Value> {
     }))
 }
 
-fn table(name: &str, tree: &PhaseTree, resolution_mm: f64) -> Markup {
+fn table(beat: &BeatTree, name: &str, tree: &PhaseTree) -> Markup {
     let is_mean = tree.doubtful_mm().is_some();
     html! {
         div {
@@ -137,34 +138,10 @@ fn table(name: &str, tree: &PhaseTree, resolution_mm: f64) -> Markup {
                 }
                 tr { td { "all" } td {} td { (format!("{:.1}", tree.length_mm())) } td {} td {} @if is_mean { td {} } }
             }
-            (lesion_table(&lesions(tree, resolution_mm)))
+            (lesion_section::section(beat, tree))
             @if let Some(mm) = tree.doubtful_mm() {
                 p { "The field is the mean of several fits. \"Other fits\" is the share of them that have a vessel there. Less than "
                     (format!("{:.0}", 100.0 * DOUBTFUL)) " % of them have " (format!("{mm:.1}")) " mm of this tree, which may be false." }
-            }
-        }
-    }
-}
-
-/// Renders the stenoses of a tree; says so where there is none.
-fn lesion_table(lesions: &[Lesion]) -> Markup {
-    if lesions.is_empty() {
-        return html! { p { "No stenosis of " (format!("{MIN_PERCENT:.0}")) " % or more was found." } };
-    }
-    html! {
-        p { "Stenoses of " (format!("{MIN_PERCENT:.0}")) " % or more:" }
-        table {
-            tr { th { "stenosis, %" } th { "branch" } th { "from the root, mm" } th { "length, mm" } th { "diameter, mm" }
-                th { "reference, mm" } }
-            @for lesion in lesions {
-                tr {
-                    td { (format!("{:.0}", lesion.percent())) }
-                    td { (lesion.branch) }
-                    td { (format!("{:.1}", lesion.from_root_mm)) }
-                    td { (format!("{:.1}", lesion.length_mm)) }
-                    td { (format!("{:.2}", lesion.min_diameter_mm)) }
-                    td { (format!("{:.2}", lesion.reference_diameter_mm)) }
-                }
             }
         }
     }
