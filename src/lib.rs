@@ -241,6 +241,7 @@ pub mod trees {
     mod follow;
     mod graph;
     pub mod lesions;
+    pub mod next_view;
     mod radii;
     mod refine;
     mod sampled;

@@ -85,6 +85,49 @@ fn options_change_what_is_found() {
 }
 
 #[test]
+fn the_next_view_shows_vessels_apart() {
+    let Trained { directory, run, .. } = trained();
+    let picture = directory.path().join("next.png");
+    let (said, _) = ok(&["next", text(run), "-o", text(&picture)]);
+    let suggested: Vec<&str> = said.lines().collect();
+    assert_eq!(suggested.len(), 3, "{said}");
+    assert!(suggested.iter().all(|line| line.contains("degrees from the nearest training view")), "{said}");
+    let drawn = image::open(&picture).unwrap();
+    assert_eq!((drawn.width(), drawn.height()), (37 * 16 + 128, 17 * 16 + 128), "a cell per five degrees");
+
+    let limits = ["--primary", "-40,40", "--secondary=-10,20", "--step", "10", "--json"];
+    let answer = |more: &[&str]| -> Value {
+        serde_json::from_str(&ok(&[&["next", text(run)], &limits[..], more].concat()).0).unwrap()
+    };
+    let whole = answer(&[]);
+    let positions = whole["positions"].as_array().unwrap();
+    assert_eq!(positions.len(), 9 * 4);
+    let cost = |candidate: &Value| candidate["cost"].as_f64().unwrap();
+    let least = positions.iter().map(cost).fold(f64::INFINITY, f64::min);
+    assert_eq!(cost(&whole["suggested"][0]), least);
+    let is_within = |candidate: &Value, field: &str, low: f64, high: f64| {
+        (low..=high).contains(&candidate[field].as_f64().unwrap())
+    };
+    assert!(positions.iter().all(|c| is_within(c, "primary_deg", -40.0, 40.0)));
+    assert!(positions.iter().all(|c| is_within(c, "secondary_deg", -10.0, 20.0)));
+    // The sight of a branch is that of the branch alone.
+    let of_branch = answer(&["--branch", "0"]);
+    assert_eq!(of_branch["branch"], 0);
+    assert!(of_branch["positions"][0]["foreshortening"] != positions[0]["foreshortening"]);
+
+    for (more, parts) in [
+        (&["--branch", "99"][..], "branches 0 to "),
+        (&["--primary", "40,-40"], "primary"),
+        (&["--secondary", "7"], "LOW,HIGH"),
+        (&["--step", "0.1"], "step"),
+    ] {
+        let out = nertca(&[&["next", text(run)], more].concat());
+        let stderr = String::from_utf8_lossy(&out.stderr);
+        assert!(out.status.code() == Some(2) && stderr.contains(parts), "{more:?}: {stderr}");
+    }
+}
+
+#[test]
 fn what_has_no_tree_is_refused() {
     let (directory, Trained { data, run, .. }) = (tempfile::tempdir().unwrap(), trained());
     let out = directory.path().join("x.json");

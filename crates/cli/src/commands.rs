@@ -9,6 +9,7 @@ use super::eval::{self, EvalArgs};
 use super::export::{self, ConvertArgs, ExportArgs};
 use super::info::{self, InfoArgs};
 use super::kernels::{self, KernelsArgs};
+use super::next::{self, NextArgs};
 use super::options::GlobalOptions;
 use super::progress::clean_up_on_signals;
 use super::render::{self, RenderArgs};
@@ -67,6 +68,8 @@ pub enum Command {
     Export(ExportArgs),
     /// Extract the vessels of a run as trees: centrelines with radii in mm, tracked over the beat.
     Tree(TreeArgs),
+    /// Suggest the view to take next: where no vessel covers another, and new ones are seen.
+    Next(NextArgs),
     /// Correct views whose geometry is inconsistent, from the angiograms alone.
     Calibrate(CalibrateArgs),
     /// Convert a dataset between the native and the authors' layout.
@@ -98,6 +101,7 @@ impl Command {
                 | Command::Render(_)
                 | Command::Export(_)
                 | Command::Tree(_)
+                | Command::Next(_)
                 | Command::Calibrate(_)
                 | Command::Convert(_)
         )
@@ -123,6 +127,7 @@ impl Cli {
             Command::Watch(args) => watch::run(global, args),
             Command::Export(args) => export::export(global, args),
             Command::Tree(args) => tree::run(global, args),
+            Command::Next(args) => next::run(global, args),
             Command::Calibrate(args) => calibrate::run(args),
             Command::Convert(args) => export::convert(args),
             Command::Bench(args) => bench::run(global, args),

@@ -34,6 +34,7 @@ mod kernels;
 mod lesion_section;
 mod lettering;
 mod memory;
+mod next;
 mod options;
 mod output;
 mod page;

@@ -145,14 +145,21 @@ fn in_words(lesion: &Lesion) -> String {
     )
 }
 
-/// Returns the training views of a run as it was calibrated; says so where they are not known.
-fn training_views(run: &Path) -> Vec<TreeView> {
+/// Finds the vessels of a model at phases.
+pub fn found_in_phases(global: &GlobalOptions, gpu: &Gpu, model: &Model, phases: Vec<u32>) -> Result<BeatTree> {
+    let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };
+    // Ctrl-C may end the program at once, because nothing has been written.
+    find(global, gpu, model, &AtomicBool::new(false), &options)
+}
+
+/// Returns the training views of a run as it was calibrated; where they are not known, `lacking` says what that means.
+pub fn training_views(run: &Path, lacking: &str) -> Vec<TreeView> {
     let directory = if run.is_dir() { run } else { run.parent().unwrap_or(Path::new("")) };
     let views = RunInfo::read(run)
         .and_then(|info| as_trained(Dataset::open(&info.dataset)?, directory))
         .map(|dataset| TreeView::of(&dataset));
     views.unwrap_or_else(|error| {
-        eprintln!("the sight of stenoses in the training views is not stated: {error}");
+        eprintln!("{lacking}: {error}");
         Vec::new()
     })
 }
@@ -169,7 +176,7 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     let options = TreeOptions { phases, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
     // Ctrl-C may end the program at once, because no partial result has been written here.
     let mut beat = find(global, &gpu, &model, &AtomicBool::new(false), &options)?;
-    beat.views = training_views(&args.run);
+    beat.views = training_views(&args.run, "the sight of stenoses in the training views is not stated");
     let made = write(&beat, &args.out, format, all)?;
     earlier.make_way(&made)?;
     made.iter().for_each(|path| out!("{}", path.display()));
