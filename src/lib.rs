@@ -219,6 +219,8 @@ pub mod export {
     #[cfg(feature = "dicom")]
     pub mod dicom;
     pub mod motion;
+    #[cfg(feature = "dicom")]
+    pub mod segmentation;
     pub mod splats;
     pub mod surfaces;
     pub mod volumes;

@@ -15,7 +15,7 @@ use std::path::Path;
 const WHITE: f64 = 65535.0;
 const EXPLICIT_LITTLE_ENDIAN: &str = "1.2.840.10008.1.2.1";
 /// Label that viewers show beside the picture, wherever they show text of the file.
-const LABEL: &str = "RESEARCH USE ONLY - NOT FOR DIAGNOSIS";
+pub(super) const LABEL: &str = "RESEARCH USE ONLY - NOT FOR DIAGNOSIS";
 /// Largest number of characters of a decimal string.
 const DECIMAL_CHARACTERS: usize = 16;
 /// Largest size of pixel data of explicit length, bytes.
@@ -40,7 +40,7 @@ pub struct DicomView<'a> {
 }
 
 /// Formats a number with a length that DICOM accepts, as precisely as this length allows.
-fn decimal(value: f64) -> String {
+pub(super) fn decimal(value: f64) -> String {
     let texts = (0..=DECIMAL_CHARACTERS).rev().map(|digits| format!("{value:.digits$}"));
     let mut fits = texts.filter(|text| text.len() <= DECIMAL_CHARACTERS).map(|text| match text.contains('.') {
         true => text.trim_end_matches('0').trim_end_matches('.').to_owned(),
@@ -79,6 +79,11 @@ pub fn write(path: &Path, view: &DicomView<'_>) -> Result<()> {
     describe(&mut object, view);
     geometry(&mut object, view);
     pixels(&mut object, view, [columns, rows]);
+    write_object(path, object)
+}
+
+/// Writes an object as a DICOM file.
+pub(super) fn write_object(path: &Path, object: InMemDicomObject) -> Result<()> {
     let failed = |e: &dyn std::error::Error| Error::Internal(format!("DICOM: {e}"));
     let meta = FileMetaTableBuilder::new().transfer_syntax(EXPLICIT_LITTLE_ENDIAN);
     let file = object.with_meta(meta).map_err(|e| failed(&e))?;
@@ -87,12 +92,13 @@ pub fn write(path: &Path, view: &DicomView<'_>) -> Result<()> {
     Ok(files::write_atomic(path, &bytes)?)
 }
 
-fn text(object: &mut InMemDicomObject, tag: Tag, vr: VR, value: &str) {
+/// Adds an attribute that is a text.
+pub(super) fn add_text(object: &mut InMemDicomObject, tag: Tag, vr: VR, value: &str) {
     object.put(DataElement::new(tag, vr, PrimitiveValue::from(value)));
 }
 
 /// Adds a required attribute whose value is unknown.
-fn unknown(object: &mut InMemDicomObject, tag: Tag, vr: VR) {
+pub(super) fn add_unknown(object: &mut InMemDicomObject, tag: Tag, vr: VR) {
     object.put(DataElement::new(tag, vr, PrimitiveValue::Empty));
 }
 
@@ -111,7 +117,7 @@ fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
         (tags::X_RAY_TUBE_CURRENT, VR::IS),
         (tags::EXPOSURE_TIME, VR::IS),
     ] {
-        unknown(object, tag, vr);
+        add_unknown(object, tag, vr);
     }
     let [study, series, image] = view.seeds.map(uid);
     for (tag, vr, value) in [
@@ -122,6 +128,7 @@ fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
         (tags::SERIES_INSTANCE_UID, VR::UI, &series),
         (tags::IMAGE_TYPE, VR::CS, "DERIVED\\SECONDARY\\SINGLE PLANE"),
         (tags::MODALITY, VR::CS, "XA"),
+        (tags::BODY_PART_EXAMINED, VR::CS, "HEART"),
         (tags::PATIENT_NAME, VR::PN, "RESEARCH^RECONSTRUCTION"),
         (tags::PATIENT_ID, VR::LO, "RESEARCH"),
         (tags::STUDY_DESCRIPTION, VR::LO, LABEL),
@@ -138,7 +145,7 @@ fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
         (tags::LOSSY_IMAGE_COMPRESSION, VR::CS, "00"),
         (tags::PATIENT_POSITION, VR::CS, "HFS"),
     ] {
-        text(object, tag, vr, value);
+        add_text(object, tag, vr, value);
     }
 }
 
@@ -148,7 +155,7 @@ fn half_turn_deg(angle_deg: f64) -> f64 {
 }
 
 /// Makes a new UID: a random UUID (version 4, RFC 9562) as a decimal number, PS3.5 B.2.
-fn uid(random: u128) -> String {
+pub(super) fn uid(random: u128) -> String {
     let version = 0xf_u128 << 76;
     let variant = 0b11_u128 << 62;
     format!("2.25.{}", random & !version & !variant | 4 << 76 | 0b10 << 62)
@@ -157,7 +164,7 @@ fn uid(random: u128) -> String {
 /// Adds the geometry of the view.
 fn geometry(object: &mut InMemDicomObject, view: &DicomView<'_>) {
     let c_arm = view.c_arm;
-    text(object, tags::POSITIONER_MOTION, VR::CS, "STATIC");
+    add_text(object, tags::POSITIONER_MOTION, VR::CS, "STATIC");
     for (tag, value) in [
         (tags::POSITIONER_PRIMARY_ANGLE, half_turn_deg(c_arm.primary_deg)),
         (tags::POSITIONER_SECONDARY_ANGLE, c_arm.secondary_deg),
@@ -165,11 +172,11 @@ fn geometry(object: &mut InMemDicomObject, view: &DicomView<'_>) {
         (tags::DISTANCE_SOURCE_TO_PATIENT, c_arm.sod_mm),
         (tags::ESTIMATED_RADIOGRAPHIC_MAGNIFICATION_FACTOR, c_arm.sid_mm / c_arm.sod_mm),
     ] {
-        text(object, tag, VR::DS, &decimal(value));
+        add_text(object, tag, VR::DS, &decimal(value));
     }
     // DICOM lists the spacing of rows first.
     let [across, down] = c_arm.pixel_mm.map(decimal);
-    text(object, tags::IMAGER_PIXEL_SPACING, VR::DS, &format!("{down}\\{across}"));
+    add_text(object, tags::IMAGER_PIXEL_SPACING, VR::DS, &format!("{down}\\{across}"));
 }
 
 fn pixels(object: &mut InMemDicomObject, view: &DicomView<'_>, [columns, rows]: [u16; 2]) {
@@ -196,7 +203,7 @@ fn pixels(object: &mut InMemDicomObject, view: &DicomView<'_>, [columns, rows]: 
         (tags::WINDOW_CENTER, VR::DS, &decimal(0.5 * (min + max))),
         (tags::WINDOW_WIDTH, VR::DS, &decimal((max - min).max(1.0))),
     ] {
-        text(object, tag, vr, value);
+        add_text(object, tag, vr, value);
     }
     object.put(DataElement::new(tags::FRAME_INCREMENT_POINTER, VR::AT, PrimitiveValue::from(tags::FRAME_TIME)));
     object.put(DataElement::new(tags::PIXEL_DATA, VR::OW, PrimitiveValue::U16(codes.into())));

@@ -7,6 +7,8 @@ use nertca_vk::checkpoint::newest_model;
 use nertca_vk::formats::npy;
 use nertca_vk::geometry::Geometry;
 use nertca_vk::scan::dataset::Dataset;
+use std::path::Path;
+use std::process::Command;
 
 const PHASES: usize = 4;
 const ANGLES: (f64, f64) = (-31.25, 22.5);
@@ -69,6 +71,50 @@ fn a_rendered_beat_is_an_angiogram() {
         let [of_beat, of_still] = [&beat, &still].map(|file| file.element(tag).unwrap().to_str().unwrap());
         assert_ne!(of_beat, of_still, "{tag}");
     }
+    expect_segmentations(directory.path(), &trained);
+    for file in ["beat.dcm", "still.dcm", "vessels_0000.dcm", "vessels_0003.dcm"] {
+        expect_valid(&at(file));
+    }
     let (said, refused) = render("most.dcm", &["--projection", "mip"], false);
     assert!(said.contains("--projection") && said.contains("line integrals") && !refused.exists(), "{said}");
+}
+
+/// Validates a DICOM file with dciodvfy.
+#[track_caller]
+fn expect_valid(file: &Path) {
+    let outcome = Command::new("dciodvfy").arg(file).output().expect("dciodvfy, of the Debian package dicom3tools");
+    let said = String::from_utf8_lossy(&outcome.stderr);
+    let (warnings, faults): (Vec<&str>, Vec<&str>) =
+        said.lines().filter(|line| !["XAImage", "Segmentation"].contains(line)).partition(|l| l.starts_with("Warning"));
+    assert!(faults.is_empty(), "{}: {said}", file.display());
+    // Dates and names of the study are not known.
+    assert!(warnings.iter().all(|line| line.contains("DICOMDIR")), "{}: {said}", file.display());
+}
+
+/// Exports the vessels as segmentations, which highdicom and dcmqi read back, voxel by voxel.
+fn expect_segmentations(directory: &Path, trained: &Path) {
+    let at = |name: &str| directory.join(name);
+    let export = |name: &str, more: &[&str], succeeds: bool| {
+        let out = at(name);
+        (run(&[&["export", text(trained), "-o", text(&out)], more].concat(), succeeds), out)
+    };
+    // A low threshold, because the field is hardly trained.
+    let rule = ["--spacing", "0.8", "--iso", "3e-4"];
+    export("beat.nrrd", &rule[..2], true);
+    export("vessels.dcm", &[&["--segmentation"], &rule[..]].concat(), true);
+    let script = crate::root::root().join("tests/python/check_segmentation.py");
+    let outcome = python().arg(script).args([directory, Path::new("3e-4")]).output().unwrap();
+    print!("{}", String::from_utf8_lossy(&outcome.stdout));
+    assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
+    for (name, more, part) in [
+        ("vessels.dcm", &["--segmentation"][..], "--force"),
+        ("vessels.nrrd", &["--segmentation"], ".dcm"),
+        ("one.dcm", &["--segmentation", "--component", "total"], "dynamic field only"),
+        ("one.dcm", &["--segmentation", "--phase", "0", "--iso", "1e3"], "no vessel has this"),
+        ("one.nrrd", &["--iso", "1e-3"], "--segmentation"),
+    ] {
+        let (said, _) = export(name, more, false);
+        assert!(said.contains(part), "{more:?}: {said}");
+    }
+    assert!(!at("one.dcm").exists());
 }

@@ -2,18 +2,21 @@
 
 use super::data::bar;
 use super::options::{GlobalOptions, choice};
-use super::output::{Earlier, write_dataset};
+use super::output::{Earlier, random_numbers, write_dataset};
 use clap::Args;
 use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::export::motion::{MotionExport, MotionFormat, deformable_set, write_trajectories};
+use nertca_vk::export::segmentation::{self, Segmentation, SegmentationSeeds};
 use nertca_vk::export::splats::write_splats;
 use nertca_vk::export::surfaces::{MeshFormat, write_meshes};
 use nertca_vk::export::volumes::{Compression, Format, VolumeExport, grid_over};
+use nertca_vk::files;
 use nertca_vk::formats::nrrd::Encoding;
 use nertca_vk::model::Model;
 use nertca_vk::model::component::Component;
+use nertca_vk::render::grid::PatientGrid;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::scan::writer::convert as convert_dataset;
@@ -44,8 +47,8 @@ pub struct ExportArgs {
     /// (animated).
     #[arg(long, conflicts_with = "format")]
     pub mesh: bool,
-    /// Attenuation of the surface, 1/mm; by default the Dice threshold.
-    #[arg(long, requires = "mesh", value_name = "PER_MM")]
+    /// Attenuation of the surface, or from which on a voxel of a segmentation is vessel, 1/mm; by default the Dice threshold.
+    #[arg(long, value_name = "PER_MM")]
     pub iso: Option<f64>,
     /// Export motion instead of volumes: displacements from the reference phase (mostly 0) at the nodes of the motion
     /// grid, mm, for one deformable set of Gaussians (gaussians.form = "deformable"); --out ends in .nrrd or .vtk. Motion
@@ -60,10 +63,14 @@ pub struct ExportArgs {
     /// phase, LPS mm. Opacity is the density as a share of that of the vessels.
     #[arg(long, conflicts_with_all = ["mesh", "motion", "format", "component", "spacing", "compress"])]
     pub splats: bool,
+    /// Export the vessels as DICOM segmentations: --out ends in .dcm, one file per phase, all in one series and one frame of reference,
+    /// without names, dates and references to the source runs.
+    #[arg(long, conflicts_with_all = ["mesh", "motion", "splats", "format", "compress"])]
+    pub segmentation: bool,
     /// Replace the files of an earlier series (`NAME_0000.EXT` and so on), all of them.
     #[arg(short, long)]
     pub force: bool,
-    /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .nii.gz, .mha, .npy or .vtk; .ply with --splats.
+    /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .nii.gz, .mha, .npy or .vtk; .ply with --splats, .dcm with --segmentation.
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
 }
@@ -108,19 +115,23 @@ pub fn export(global: &GlobalOptions, args: &ExportArgs) -> Result<()> {
     if args.splats {
         return export_splats(args, &model, &phases);
     }
-    if args.mesh && args.component.has_static() {
-        return Err(Error::config(
-            "--component",
-            "",
-            "surfaces are extracted from the dynamic field only: use --component dynamic",
-        ));
+    let of_vessels = args.mesh || args.segmentation;
+    if of_vessels && args.component.has_static() {
+        let problem = "surfaces and segmentations are made of the dynamic field only: use --component dynamic";
+        return Err(Error::config("--component", args.component.name(), problem));
+    }
+    if args.iso.is_some() && !of_vessels {
+        let problem = "is the threshold of surfaces and segmentations: add --mesh or --segmentation";
+        return Err(Error::config("--iso", args.iso.unwrap_or_default(), problem));
     }
     let unknown = |known: &str| Error::config("--out", args.out.display(), format!("does not end in one of {known}"));
     let grid = grid_over(&model.scene, args.component, args.spacing)?;
     let gpu = global.open_device()?;
     let renderer = Renderer::new(&gpu, &model, global.tuning(&gpu, &model.config))?;
     let mut progress = bar();
-    let made = if args.mesh {
+    let made = if args.segmentation {
+        write_segmentations(args, (&renderer, &model), &grid, &phases, &mut progress)?
+    } else if args.mesh {
         let format = MeshFormat::of(&args.out).ok_or_else(|| unknown(".stl .ply .obj .glb"))?;
         let earlier = earlier(args, phases.len() > 1 && format != MeshFormat::Glb)?;
         let iso = match args.iso {
@@ -158,6 +169,59 @@ pub fn export(global: &GlobalOptions, args: &ExportArgs) -> Result<()> {
     );
     drop(renderer);
     global.close_device(&gpu)
+}
+
+/// Writes the vessels of phases as DICOM segmentations; returns the files.
+fn write_segmentations(
+    args: &ExportArgs,
+    (renderer, model): (&Renderer, &Model),
+    grid: &PatientGrid,
+    phases: &[u32],
+    progress: &mut impl FnMut(&str, u64, u64),
+) -> Result<Vec<PathBuf>> {
+    if !args.out.extension().is_some_and(|end| end.eq_ignore_ascii_case("dcm")) {
+        return Err(Error::config("--out", args.out.display(), "does not end in .dcm"));
+    }
+    let iso_per_mm = match args.iso {
+        Some(iso) if !(iso.is_finite() && iso > 0.0) => {
+            return Err(Error::config("--iso", iso, "is not a positive attenuation per mm"));
+        }
+        Some(iso) => iso,
+        None => vessel_threshold_per_mm(renderer, model, grid)?,
+    };
+    let earlier = earlier(args, phases.len() > 1)?;
+    let [study, series, frame] = random_numbers()?;
+    let rule = format!("attenuation above {iso_per_mm:.4e} per mm, {} iterations", model.step);
+    let mut made = Vec::new();
+    for phase in phases {
+        let values = renderer.sample_patient(Component::Dynamic, *phase, grid)?;
+        let inside: Vec<bool> = values.iter().map(|value| f64::from(*value) > iso_per_mm).collect();
+        if !inside.contains(&true) {
+            eprintln!("phase {phase} has no vessel above {iso_per_mm:.4e} per mm, so that no file is written for it");
+            continue;
+        }
+        let [instance, dimensions] = random_numbers()?;
+        let file = if phases.len() == 1 { args.out.clone() } else { files::of_phase(&args.out, *phase) };
+        let segmentation = Segmentation {
+            grid: *grid,
+            inside: &inside,
+            phase: [*phase, model.shown_phases()],
+            rule: &rule,
+            seeds: SegmentationSeeds { study, series, frame, instance, dimensions },
+        };
+        segmentation::write(&file, &segmentation)?;
+        made.push(file);
+        progress("segmentation", made.len() as u64, phases.len() as u64);
+    }
+    if made.is_empty() {
+        return Err(Error::config(
+            "--iso",
+            format!("{iso_per_mm:.4e}"),
+            "is too high: no vessel has this attenuation at any phase",
+        ));
+    }
+    earlier.make_way(&made)?;
+    Ok(made)
 }
 
 /// Files of an earlier series in the way of an export that writes one file per phase.

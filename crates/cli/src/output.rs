@@ -203,3 +203,12 @@ impl Earlier {
         old.try_for_each(|path| std::fs::remove_file(path).map_err(Error::io("remove", path)))
     }
 }
+
+/// Returns random numbers of the system, from which new UIDs are made.
+pub fn random_numbers<const N: usize>() -> Result<[u128; N]> {
+    let mut bytes = [[0u8; 16]; N];
+    for number in &mut bytes {
+        getrandom::fill(number).map_err(|e| Error::Internal(format!("random numbers could not be obtained: {e}")))?;
+    }
+    Ok(bytes.map(u128::from_le_bytes))
+}

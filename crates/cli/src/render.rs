@@ -2,6 +2,7 @@
 
 use super::frame_rates::{measure_frame_rates, print_frame_rates};
 use super::options::{GlobalOptions, choice};
+use super::output::random_numbers;
 use super::viewpoint::{Viewpoint, turned, viewpoint};
 use clap::Args;
 use nertca_vk::checkpoint::newest_model;
@@ -93,10 +94,6 @@ const MIN_MS: u32 = 20;
 fn write_dicom(args: &RenderArgs, out: &Path, model: &Model, viewpoint: &Viewpoint, frames: &[Vec<f32>]) -> Result<()> {
     let size = [viewpoint.width, viewpoint.height];
     let beat_frames = model.shown_phases() * (args.between + 1);
-    let mut seeds = [[0u8; 16]; 3];
-    for seed in &mut seeds {
-        getrandom::fill(seed).map_err(|e| Error::Internal(format!("random numbers could not be obtained: {e}")))?;
-    }
     let shown = args.component.name();
     let description = format!(
         "Rendering of a reconstruction of {} iterations: {shown} attenuation, phase {}",
@@ -108,7 +105,7 @@ fn write_dicom(args: &RenderArgs, out: &Path, model: &Model, viewpoint: &Viewpoi
         frames,
         frame_ms: 1e3 * SYSTOLE_S / SYSTOLE_SHARE / f64::from(beat_frames),
         description: &description,
-        seeds: seeds.map(u128::from_le_bytes),
+        seeds: random_numbers()?,
     };
     dicom::write(out, &view)
 }
