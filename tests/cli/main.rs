@@ -27,6 +27,7 @@ mod capi_truth;
 mod dicom_export;
 mod first_session;
 mod gaussian_runs;
+mod igtl;
 mod imperfect_angiograms;
 mod inflow;
 mod interfaces;

@@ -15,11 +15,11 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-const PHASES: usize = 6;
+pub const PHASES: usize = 6;
 /// Range of the integrals that grey values represent, as the import assumes for logarithmic ones.
 const SPAN: f32 = 3.0;
 
-fn text(path: &Path) -> &str {
+pub fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
@@ -31,7 +31,7 @@ fn ok(args: &[&str]) -> String {
 }
 
 /// Angiograms of a phantom as DICOM runs, one per training view.
-fn runs(directory: &Path) -> Vec<PathBuf> {
+pub fn runs(directory: &Path) -> Vec<PathBuf> {
     let data = directory.join("phantom");
     ok(&["phantom", text(&data), "--size", "48", "--phases", &PHASES.to_string(), "--views", "3", "--no-volumes"]);
     let dataset = Dataset::open(&data).unwrap();
@@ -69,7 +69,7 @@ fn runs(directory: &Path) -> Vec<PathBuf> {
 }
 
 /// The running program, until it is dropped.
-struct Watcher {
+pub struct Watcher {
     process: Child,
     url: String,
     said: Arc<Mutex<String>>,
@@ -77,7 +77,7 @@ struct Watcher {
 }
 
 impl Watcher {
-    fn new(args: &[&str]) -> Watcher {
+    pub fn new(args: &[&str]) -> Watcher {
         let mut process =
             program().arg("watch").args(args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         let (said, stderr) = (Arc::new(Mutex::new(String::new())), process.stderr.take().unwrap());
@@ -96,11 +96,16 @@ impl Watcher {
 
     /// Waits for a message of the program.
     #[track_caller]
-    fn hear(&mut self, what: &str) {
+    pub fn hear(&mut self, what: &str) {
         while !self.said.lock().unwrap().contains(what) {
             assert!(self.process.try_wait().unwrap().is_none(), "it ended without saying `{what}`");
             std::thread::sleep(Duration::from_millis(50));
         }
+    }
+
+    /// All messages so far.
+    pub fn heard(&self) -> String {
+        self.said.lock().unwrap().clone()
     }
 
     /// Status and body of a response.
@@ -121,19 +126,19 @@ impl Watcher {
 
     /// Waits until the page reports the expected progress.
     #[track_caller]
-    fn reach(&self, done: impl Fn(&Value) -> bool) {
+    pub fn reach(&self, done: impl Fn(&Value) -> bool) {
         while !done(&self.about()) {
             std::thread::sleep(Duration::from_millis(50));
         }
     }
 
-    fn interrupt(&self) {
+    pub fn interrupt(&self) {
         let sent = std::process::Command::new("kill").args(["-INT", &self.process.id().to_string()]).status();
         assert!(sent.unwrap().success());
     }
 
     /// All messages, and whether the program ended successfully.
-    fn end(mut self) -> (String, bool) {
+    pub fn end(mut self) -> (String, bool) {
         let status = self.process.wait().unwrap();
         self.reader.take().unwrap().join().unwrap();
         (self.said.lock().unwrap().clone(), status.success())
@@ -176,7 +181,7 @@ fn runs_are_taken_in_as_they_come() {
     std::fs::write(at("phases.txt"), list).unwrap();
     let (frames, phases, phase_list) = (format!("1-{PHASES}"), PHASES.to_string(), at("phases.txt"));
     let reading = ["--phases", &phases, "--frames", &frames, "--phase-list", text(&phase_list)];
-    // A session does not adjust its views, and makes a single fit.
+    // The result is to be that of `train` with one fit to views as they are calibrated.
     let short = ["train.iterations=40", "gaussians.iterations=30", "calibrate.adjust=off", "gaussians.fits=1"]
         .map(|setting| ["--set", setting])
         .concat();

@@ -29,6 +29,7 @@ mod exit;
 mod export;
 mod frame_rates;
 mod geometry_picture;
+mod igtl_server;
 mod info;
 mod kernels;
 mod lesion_section;

@@ -1,6 +1,7 @@
 //! `watch`: reconstructs DICOM runs as they appear in a folder.
 
 use super::dicom_args::DicomArgs;
+use super::igtl_server::IgtlServer;
 use super::options::{ConfigArgs, GlobalOptions};
 use super::progress::stop_flag;
 use super::view_server::{AngiogramGeometry, Server};
@@ -22,6 +23,7 @@ use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::scan::dataset::Split;
 use nertca_vk::scan::prior::VesselPrior;
 use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions, State};
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -47,6 +49,12 @@ pub struct WatchArgs {
     /// Port of the viewer's page on 127.0.0.1; a free one by default.
     #[arg(long, default_value_t = 0)]
     pub port: u16,
+    /// Also send the overlay and the vessels to OpenIGTLink clients, such as 3D Slicer, that connect to this port; 0 for a free one.
+    #[arg(long, value_name = "PORT")]
+    pub igtl: Option<u16>,
+    /// Address of the OpenIGTLink port. Anyone who reaches it can read the reconstruction: this computer alone by default.
+    #[arg(long, value_name = "ADDRESS", requires = "igtl", default_value = "127.0.0.1")]
+    pub igtl_bind: IpAddr,
     /// Vessels that are known before, e.g. from a CT, as `train --prior` takes them.
     #[arg(long, value_name = "FILE")]
     pub prior: Option<PathBuf>,
@@ -79,7 +87,12 @@ pub fn run(global: &GlobalOptions, args: &WatchArgs) -> Result<()> {
     let live = Arc::new(Live::new(if intake.is_still() { 1 } else { intake.phases() }, config.train.iterations));
     let tree = Arc::new(TreeWork::new(&gpu, tuning.clone()));
     let server = Server::open(args.port, live.clone(), tree.clone())?;
+    let igtl =
+        args.igtl.map(|port| IgtlServer::open((args.igtl_bind, port), live.clone(), tree.clone())).transpose()?;
     out!("{}", server.url());
+    if let Some(igtl) = &igtl {
+        eprintln!("OpenIGTLink: {}", igtl.address());
+    }
     eprintln!("watching {}; press Ctrl-C to end", args.directory.display());
     let (end, ended) = oneshot::channel::<()>();
     let serving = std::thread::spawn(move || {
@@ -106,6 +119,7 @@ pub fn run(global: &GlobalOptions, args: &WatchArgs) -> Result<()> {
     };
     let ends = || stop.load(Ordering::Relaxed) || serving.is_finished();
     let watched = watch.until(&mut folder, &ends, args.until_idle);
+    drop(igtl);
     // The run directory is written before everything that may fail or take long.
     let left = watch.leave(&args.out);
     drop(end);

@@ -16,6 +16,7 @@ pub mod files;
 #[cfg(feature = "frames")]
 pub mod frames;
 pub mod gltf;
+pub mod igtl;
 pub mod image_limits;
 pub mod images;
 pub mod mesh;
