@@ -739,6 +739,44 @@ typedef struct {
 } nertca_tree;
 
 /**
+ * A stenosis of the vessels that were found: a place where a vessel is narrower than its course elsewhere lets expect.
+ */
+typedef struct {
+  /**
+   * `sizeof(nertca_lesion)`.
+   */
+  size_t size;
+  /**
+   * Cardiac phase, from 0.
+   */
+  uint32_t phase;
+  /**
+   * Branch with the least diameter, as its index in the arrays `branch_*` of `nertca_tree`.
+   */
+  uint32_t branch;
+  /**
+   * Point of the branch with the least diameter, from 0.
+   */
+  uint32_t point;
+  /**
+   * Position of the least diameter along the vessels, mm from the root.
+   */
+  double from_root_mm;
+  /**
+   * Length of the part that is narrowed by a tenth of the reference or more, mm.
+   */
+  double length_mm;
+  /**
+   * Least diameter, mm.
+   */
+  double min_diameter_mm;
+  /**
+   * Reference diameter there, mm: the stenosis is 1 - `min_diameter_mm` / `reference_diameter_mm`.
+   */
+  double reference_diameter_mm;
+} nertca_lesion;
+
+/**
  * Scores on the frames added for validation, and of the vessels in 3D where the truth is known.
  */
 typedef struct {
@@ -1444,6 +1482,23 @@ nertca_status nertca_buffer_destroy(nertca_buffer *buffer);
  */
 nertca_status nertca_reconstruction_tree(nertca_reconstruction *reconstruction,
                                          nertca_tree *tree);
+
+/**
+ * Returns a stenosis, from 0, of the vessels that `nertca_reconstruction_tree` found last; `count` receives the number of all stenoses,
+ * phase by phase. A null `lesion` asks for the number alone. A vessel is judged if it is wider than the field's resolution, except near its
+ * ends; stenoses of less than 30 % are not listed. Where points are followed, a point has one radius, so that phases differ only as far as
+ * lengths along the vessel change. Callable from any thread, also during training.
+ *
+ * @return NERTCA_ERROR_NOT_READY before `nertca_reconstruction_tree` has found vessels; NERTCA_ERROR_ARGUMENT for an `index` beyond the
+ * last stenosis, and where both pointers are null.
+ *
+ * # Safety
+ * `lesion` must be null or writable, with its size set; `count` must be null or writable.
+ */
+nertca_status nertca_reconstruction_lesion(nertca_reconstruction *reconstruction,
+                                           size_t index,
+                                           nertca_lesion *lesion,
+                                           size_t *count);
 
 /**
  * Sets the true vessel voxels at the phase of `grid`, in place of those set before for that phase. `vessels` has one byte for

@@ -36,7 +36,7 @@ from .errors import (
 from .geometry import CArm, Geometry
 from .intensity import Integral, Intensity, Linear, Logarithmic
 from .reconstruction import Component, Projection, Quality, Reconstruction, Split
-from .results import Branch, Correction, Device, Drawn, FrameStatus, Grid, Progress, Scores, Tree
+from .results import Branch, Correction, Device, Drawn, FrameStatus, Grid, Lesion, Progress, Scores, Tree
 
 __version__ = _version()
 
@@ -63,6 +63,7 @@ __all__ = [
     "FrameStatus",
     "Geometry",
     "Grid",
+    "Lesion",
     "HandleError",
     "Integral",
     "Intensity",

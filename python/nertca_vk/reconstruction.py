@@ -31,7 +31,7 @@ from .context import Context
 from .errors import BufferTooSmallError, Error
 from .geometry import Geometry, as_struct
 from .intensity import Integral, Intensity
-from .results import Branch, Correction, CorrectionKind, Drawn, FrameStatus, FrameUse, Grid, Progress, Scores, Tree
+from .results import Branch, Correction, CorrectionKind, Drawn, FrameStatus, FrameUse, Grid, Lesion, Progress, Scores, Tree
 
 Component = Literal["total", "static", "dynamic"]
 """Both fields, the static background, or the dynamic field."""
@@ -587,6 +587,7 @@ class Reconstruction:
             for name, memory in kept.items():
                 setattr(struct, name, ffi.cast(ffi.typeof(getattr(struct, name)), memory))
             check(lib.nertca_reconstruction_tree(handle, struct), handle)
+            lesions = self._lesions(handle)
         branches = [
             Branch(
                 phase=int(phase),
@@ -596,7 +597,30 @@ class Reconstruction:
             )
             for phase, parent, first, count in zip(*of_branches.values())
         ]
-        return Tree(threshold_per_mm=struct.threshold_per_mm, followed=struct.followed == 1, branches=branches)
+        return Tree(
+            threshold_per_mm=struct.threshold_per_mm, followed=struct.followed == 1, branches=branches, lesions=lesions
+        )
+
+    def _lesions(self, handle: Any) -> list[Lesion]:
+        """The stenoses of the vessels that were found last."""
+        count = ffi.new("size_t *")
+        check(lib.nertca_reconstruction_lesion(handle, 0, ffi.NULL, count), handle)
+        found = []
+        for index in range(count[0]):
+            lesion = new("nertca_lesion")
+            check(lib.nertca_reconstruction_lesion(handle, index, lesion, ffi.NULL), handle)
+            found.append(
+                Lesion(
+                    phase=lesion.phase,
+                    branch=lesion.branch,
+                    point=lesion.point,
+                    from_root_mm=lesion.from_root_mm,
+                    length_mm=lesion.length_mm,
+                    min_diameter_mm=lesion.min_diameter_mm,
+                    reference_diameter_mm=lesion.reference_diameter_mm,
+                )
+            )
+        return found
 
     def set_true_vessels(
         self, inside: "Union[npt.NDArray[np.bool_], npt.NDArray[np.uint8], None]", grid: Grid, phase: int = 0

@@ -168,6 +168,31 @@ class Branch:
 
 
 @dataclass(frozen=True)
+class Lesion:
+    """A stenosis: a place where a vessel is narrower than its course elsewhere lets expect."""
+
+    phase: int
+    """Cardiac phase, from 0."""
+    branch: int
+    """Branch with the least diameter, by its place among the branches of the tree."""
+    point: int
+    """Point of the branch with the least diameter."""
+    from_root_mm: float
+    """Position of the least diameter along the vessels, mm from the root."""
+    length_mm: float
+    """Length of the part that is narrowed by a tenth of the reference or more, mm."""
+    min_diameter_mm: float
+    """Least diameter, mm."""
+    reference_diameter_mm: float
+    """Reference diameter there, mm."""
+
+    @property
+    def stenosis_percent(self) -> float:
+        """Narrowing in percent of the reference diameter."""
+        return 100.0 * (1.0 - self.min_diameter_mm / self.reference_diameter_mm)
+
+
+@dataclass(frozen=True)
 class Tree:
     """Vessels at all phases as trees of centrelines with radii."""
 
@@ -177,6 +202,8 @@ class Tree:
     """Whether all phases have the same branches, and point i of each is the same material point at every phase."""
     branches: list[Branch]
     """Phase by phase, each behind its parent."""
+    lesions: list[Lesion]
+    """Stenoses of 30 % or more, phase by phase."""
 
     def at(self, phase: int) -> list[Branch]:
         """The branches of one cardiac phase."""

@@ -1,8 +1,9 @@
 //! Vessels as trees of centrelines with radii.
 
 use crate::capi::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
-use crate::capi::status::{Failure, NERTCA_ERROR_BUFFER, Outcome, nertca_status};
-use crate::capi::types::{nertca_tree, read, write};
+use crate::capi::status::{Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_NOT_READY, Outcome, nertca_status};
+use crate::capi::types::{nertca_lesion, nertca_tree, read, write};
+use crate::trees::lesions::{Lesion, lesions};
 use crate::trees::tree::{BeatTree, Branch};
 use std::sync::PoisonError;
 
@@ -68,6 +69,66 @@ pub unsafe extern "C" fn nertca_reconstruction_tree(
         }
         Ok(())
     })
+}
+
+/// Returns a stenosis, from 0, of the vessels that `nertca_reconstruction_tree` found last; `count` receives the number of all stenoses,
+/// phase by phase. A null `lesion` asks for the number alone. A vessel is judged if it is wider than the field's resolution, except near its
+/// ends; stenoses of less than 30 % are not listed. Where points are followed, a point has one radius, so that phases differ only as far as
+/// lengths along the vessel change. Callable from any thread, also during training.
+///
+/// @return NERTCA_ERROR_NOT_READY before `nertca_reconstruction_tree` has found vessels; NERTCA_ERROR_ARGUMENT for an `index` beyond the
+/// last stenosis, and where both pointers are null.
+///
+/// # Safety
+/// `lesion` must be null or writable, with its size set; `count` must be null or writable.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_lesion(
+    reconstruction: *mut nertca_reconstruction,
+    index: usize,
+    lesion: *mut nertca_lesion,
+    count: *mut usize,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        if lesion.is_null() && count.is_null() {
+            return Err(Failure::argument("lesion", "is null, and count as well"));
+        }
+        let kept = reconstruction.tree.lock().unwrap_or_else(PoisonError::into_inner);
+        let nothing = "no vessels were found yet: call nertca_reconstruction_tree first";
+        let found = kept.as_ref().ok_or_else(|| Failure::new(NERTCA_ERROR_NOT_READY, nothing))?;
+        let all = lesions_of(found);
+        if !count.is_null() {
+            // SAFETY: `count` is not null, and the header requires that it can be written.
+            unsafe { count.write_unaligned(all.len()) };
+        }
+        if lesion.is_null() {
+            return Ok(());
+        }
+        let beyond = || Failure::argument("index", format!("{index} is beyond the last of {} stenoses", all.len()));
+        let chosen = *all.get(index).ok_or_else(beyond)?;
+        // SAFETY: the header requires a struct of at least `lesion->size` bytes that may be written.
+        unsafe { write(lesion, |size| nertca_lesion { size, ..chosen }) }
+    })
+}
+
+/// Returns the stenoses of all phases; branches are counted over all phases.
+fn lesions_of(found: &BeatTree) -> Vec<nertca_lesion> {
+    let mut all = Vec::new();
+    let mut first = 0;
+    for tree in &found.phases {
+        let row = |lesion: Lesion| nertca_lesion {
+            size: size_of::<nertca_lesion>(),
+            phase: tree.phase,
+            branch: (first + lesion.branch) as u32,
+            point: lesion.point as u32,
+            from_root_mm: lesion.from_root_mm,
+            length_mm: lesion.length_mm,
+            min_diameter_mm: lesion.min_diameter_mm,
+            reference_diameter_mm: lesion.reference_diameter_mm,
+        };
+        all.extend(lesions(tree, found.resolution_mm).into_iter().map(row));
+        first += tree.branches.len();
+    }
+    all
 }
 
 /// Tells whether the caller passed arrays; either all or none of them must be given.

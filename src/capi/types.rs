@@ -367,6 +367,28 @@ pub struct nertca_tree {
     pub radius_mm: *mut f64,
 }
 
+/// A stenosis of the vessels that were found: a place where a vessel is narrower than its course elsewhere lets expect.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_lesion {
+    /// `sizeof(nertca_lesion)`.
+    pub size: usize,
+    /// Cardiac phase, from 0.
+    pub phase: u32,
+    /// Branch with the least diameter, as its index in the arrays `branch_*` of `nertca_tree`.
+    pub branch: u32,
+    /// Point of the branch with the least diameter, from 0.
+    pub point: u32,
+    /// Position of the least diameter along the vessels, mm from the root.
+    pub from_root_mm: f64,
+    /// Length of the part that is narrowed by a tenth of the reference or more, mm.
+    pub length_mm: f64,
+    /// Least diameter, mm.
+    pub min_diameter_mm: f64,
+    /// Reference diameter there, mm: the stenosis is 1 - `min_diameter_mm` / `reference_diameter_mm`.
+    pub reference_diameter_mm: f64,
+}
+
 /// Scores on the frames added for validation, and of the vessels in 3D where the truth is known.
 #[repr(C)]
 #[derive(Clone, Copy)]
@@ -464,7 +486,7 @@ macro_rules! versioned {
     )* };
 }
 versioned!(nertca_log nertca_geometry nertca_frame nertca_image nertca_grid nertca_progress nertca_correction nertca_tree
-       nertca_frame_status nertca_drawn);
+       nertca_lesion nertca_frame_status nertca_drawn);
 
 // SAFETY: integers, floats and pointers after a `usize`.
 unsafe impl Versioned for nertca_view {

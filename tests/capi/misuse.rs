@@ -318,6 +318,16 @@ fn calibration(b: &Bench) {
 }
 
 fn tree(b: &Bench) {
+    let lesion = "nertca_reconstruction_lesion";
+    b.refuses(lesion, NERTCA_ERROR_ARGUMENT, "is null, and count as well", unsafe {
+        nertca_reconstruction_lesion(b.bare, 0, null_mut(), null_mut())
+    });
+    b.refuses(lesion, NERTCA_ERROR_NOT_READY, "no vessels were found yet", unsafe {
+        nertca_reconstruction_lesion(b.bare, 0, null_mut(), &mut 0)
+    });
+    b.handles(lesion, stale(b), b.context.cast(), |h| unsafe {
+        nertca_reconstruction_lesion(h, 0, null_mut(), &mut 0)
+    });
     let tree = "nertca_reconstruction_tree";
     let size = size_of::<nertca_tree>();
     let ask = |h, asked: nertca_tree| unsafe { nertca_reconstruction_tree(h, &mut { asked }) };

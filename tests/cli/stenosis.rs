@@ -1,8 +1,18 @@
 //! Stenoses of phantoms and of the trees that are found in them, through the program.
 
+#![allow(clippy::unwrap_used, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
+
 use crate::program::program;
+use nertca_vk::capi::context::*;
+use nertca_vk::capi::reconstruction::*;
+use nertca_vk::capi::status::{NERTCA_ERROR_ARGUMENT, NERTCA_ERROR_NOT_READY, NERTCA_OK};
+use nertca_vk::capi::tree::{nertca_reconstruction_lesion, nertca_reconstruction_tree};
+use nertca_vk::capi::types::{nertca_lesion, nertca_log, nertca_tree};
+use nertca_vk::checkpoint;
 use serde_json::Value;
+use std::ffi::CString;
 use std::path::Path;
+use std::ptr::{null, null_mut};
 
 fn text(path: &Path) -> &str {
     path.to_str().unwrap()
@@ -60,6 +70,45 @@ fn expect_foreshortening(tree: &Value, lesion: &Value) {
     assert!(most > least + 0.1, "views differ, so that the comparison means something: {shares:?}");
 }
 
+/// Compares the stenoses that C callers get with those of the tree of phase 0.
+fn expect_the_same_in_c(run: &Path, tree: &Value) {
+    let none: *const nertca_log = null();
+    let (mut context, mut made) = (null_mut(), null_mut());
+    let options = CString::new("phases = 6").unwrap();
+    let newest = CString::new(text(&checkpoint::newest(run).unwrap())).unwrap();
+    let ok = |status| assert_eq!(status, NERTCA_OK);
+    ok(unsafe { nertca_context_create(null(), none, &mut context) });
+    ok(unsafe { nertca_reconstruction_create(context, options.as_ptr(), &mut made) });
+    ok(unsafe { nertca_reconstruction_load(made, newest.as_ptr()) });
+    let mut count = 7;
+    let early = unsafe { nertca_reconstruction_lesion(made, 0, null_mut(), &mut count) };
+    assert_eq!((early, count), (NERTCA_ERROR_NOT_READY, 7), "no tree was asked for");
+    let mut room = nertca_tree { size: size_of::<nertca_tree>(), ..unsafe { std::mem::zeroed() } };
+    ok(unsafe { nertca_reconstruction_tree(made, &mut room) });
+    ok(unsafe { nertca_reconstruction_lesion(made, 0, null_mut(), &mut count) });
+    let wanted = tree["lesions"].as_array().unwrap();
+    assert!(count >= wanted.len(), "{count} at all phases");
+    let mut lesion = nertca_lesion { size: size_of::<nertca_lesion>(), ..unsafe { std::mem::zeroed() } };
+    for (index, wanted) in wanted.iter().enumerate() {
+        ok(unsafe { nertca_reconstruction_lesion(made, index, &mut lesion, null_mut()) });
+        let number = |field: &str| wanted[field].as_f64().unwrap();
+        assert_eq!(lesion.phase, 0);
+        assert_eq!((f64::from(lesion.branch), f64::from(lesion.point)), (number("branch"), number("point")));
+        for (ours, field) in [
+            (lesion.from_root_mm, "from_root_mm"),
+            (lesion.length_mm, "length_mm"),
+            (lesion.min_diameter_mm, "min_diameter_mm"),
+            (lesion.reference_diameter_mm, "reference_diameter_mm"),
+        ] {
+            assert!((ours - number(field)).abs() < 1e-3, "{field}: {ours}, {wanted}");
+        }
+    }
+    let beyond = unsafe { nertca_reconstruction_lesion(made, count, &mut lesion, null_mut()) };
+    assert_eq!(beyond, NERTCA_ERROR_ARGUMENT);
+    ok(unsafe { nertca_reconstruction_destroy(made) });
+    ok(unsafe { nertca_context_destroy(context) });
+}
+
 #[test]
 fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
     let directory = tempfile::tempdir().unwrap();
@@ -78,6 +127,7 @@ fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
     assert!(page.contains("stenosis, %") && page.contains("view 3, %"), "the report has a table of stenoses");
     assert!(page.contains("class=\"strip\"") && page.contains("#d0342c"), "the report has the vessel straightened");
     expect_foreshortening(&tree, lesion);
+    expect_the_same_in_c(&ill.join("run"), &tree);
 
     let (truth, tree, said) = lesions_of(&healthy, &[]);
     assert!(truth.get("lesions").is_none(), "a truth without lesions has no such field");

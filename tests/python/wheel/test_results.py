@@ -237,6 +237,11 @@ def test_a_phantoms_vessels_become_a_tree(tmp_path: Path) -> None:
             for ours, theirs in zip(found, row["branches"]):
                 np.testing.assert_allclose(ours.points_mm, theirs["points_mm"], atol=0.01)
                 np.testing.assert_allclose(ours.radius_mm, theirs["radius_mm"], atol=0.01)
+        wanted = [(row["phase"], lesion) for row in truth["phases"] for lesion in row["lesions"]]
+        assert len(tree.lesions) == len(wanted)
+        for ours, (phase, theirs) in zip(tree.lesions, wanted):
+            assert ours.phase == phase and tree.branches[ours.branch].phase == phase and ours.point == theirs["point"]
+            assert abs(ours.stenosis_percent - theirs["stenosis_percent"]) < 0.2
         ends = [tree.branches[branch.parent].points_mm[-1] for branch in tree.branches if branch.parent is not None]
         starts = [branch.points_mm[0] for branch in tree.branches if branch.parent is not None]
         assert len(ends) > 0
