@@ -1,6 +1,6 @@
 """What the library answers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, Optional
 
 import numpy as np
@@ -202,7 +202,7 @@ class Tree:
     """Whether all phases have the same branches, and point i of each is the same material point at every phase."""
     branches: list[Branch]
     """Phase by phase, each behind its parent."""
-    lesions: list[Lesion]
+    lesions: list[Lesion] = field(default_factory=list)
     """Stenoses of 30 % or more, phase by phase."""
 
     def at(self, phase: int) -> list[Branch]:
