@@ -38,8 +38,10 @@ pub struct Segmentation<'a> {
     pub grid: PatientGrid,
     /// Whether a voxel is vessel; left is the fastest axis, superior the slowest.
     pub inside: &'a [bool],
-    /// Phase, from 0, and the number of phases of the beat.
-    pub phase: [u32; 2],
+    /// Phase, from 0.
+    pub phase: u32,
+    /// Number of phases of the beat.
+    pub n_phases: u32,
     /// Rule by which a voxel is vessel.
     pub rule: &'a str,
     /// Random numbers from which the UIDs are made.
@@ -79,7 +81,7 @@ pub fn write(path: &Path, segmentation: &Segmentation<'_>) -> Result<()> {
         segmentation.inside.chunks(per_slice).enumerate().filter(|(_, slice)| slice.contains(&true)).collect();
     if slices.is_empty() {
         let problem = "has no vessel above the threshold";
-        return Err(Error::config("phase", segmentation.phase[0], problem));
+        return Err(Error::config("phase", segmentation.phase, problem));
     }
     let mut object = InMemDicomObject::new_empty();
     describe(&mut object, segmentation);
@@ -143,7 +145,7 @@ fn describe(object: &mut InMemDicomObject, segmentation: &Segmentation<'_>) {
     }
     let SegmentationSeeds { study, series, frame, instance, .. } = segmentation.seeds;
     let [study, series, frame, instance] = [study, series, frame, instance].map(uid);
-    let [phase, phases] = segmentation.phase;
+    let Segmentation { phase, n_phases, .. } = segmentation;
     let now = DateTime::<Utc>::from(SystemTime::now());
     for (tag, vr, value) in [
         (tags::SPECIFIC_CHARACTER_SET, VR::CS, "ISO_IR 192"),
@@ -164,7 +166,7 @@ fn describe(object: &mut InMemDicomObject, segmentation: &Segmentation<'_>) {
         (tags::CONTENT_DATE, VR::DA, &now.format("%Y%m%d").to_string()),
         (tags::CONTENT_TIME, VR::TM, &now.format("%H%M%S").to_string()),
         (tags::CONTENT_LABEL, VR::CS, "VESSELS"),
-        (tags::CONTENT_DESCRIPTION, VR::LO, &format!("Phase {phase} of {phases}, not for diagnosis")),
+        (tags::CONTENT_DESCRIPTION, VR::LO, &format!("Phase {phase} of {n_phases}, not for diagnosis")),
         (tags::MANUFACTURER, VR::LO, "nertca-vk"),
         (tags::MANUFACTURER_MODEL_NAME, VR::LO, "nertca-vk"),
         (tags::DEVICE_SERIAL_NUMBER, VR::LO, "0"),
@@ -184,8 +186,8 @@ fn segment(segmentation: &Segmentation<'_>) -> InMemDicomObject {
     let mut item = InMemDicomObject::new_empty();
     item.put(DataElement::new(tags::SEGMENT_NUMBER, VR::US, PrimitiveValue::from(1u16)));
     add_text(&mut item, tags::SEGMENT_LABEL, VR::LO, "Coronary arteries");
-    let [phase, phases] = segmentation.phase;
-    let description = format!("{LABEL}. Phase {phase} of {phases}; {}", segmentation.rule);
+    let Segmentation { phase, n_phases, .. } = segmentation;
+    let description = format!("{LABEL}. Phase {phase} of {n_phases}; {}", segmentation.rule);
     add_text(&mut item, tags::SEGMENT_DESCRIPTION, VR::ST, &description);
     add_text(&mut item, tags::SEGMENT_ALGORITHM_TYPE, VR::CS, "AUTOMATIC");
     add_text(&mut item, tags::SEGMENT_ALGORITHM_NAME, VR::LO, "nertca-vk");
@@ -265,7 +267,7 @@ mod tests {
     fn a_phase_without_vessels_is_refused() {
         let grid = PatientGrid { origin_mm: glam::DVec3::ZERO, spacing_mm: glam::DVec3::ONE, size: [2, 2, 2] };
         let seeds = SegmentationSeeds { study: 1, series: 2, frame: 3, instance: 4, dimensions: 5 };
-        let nothing = Segmentation { grid, inside: &[false; 8], phase: [3, 10], rule: "above 1", seeds };
+        let nothing = Segmentation { grid, inside: &[false; 8], phase: 3, n_phases: 10, rule: "above 1", seeds };
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("x.dcm");
         assert!(write(&path, &nothing).unwrap_err().to_string().contains("phase = 3: has no vessel"));

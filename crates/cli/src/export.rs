@@ -205,7 +205,8 @@ fn write_segmentations(
         let segmentation = Segmentation {
             grid: *grid,
             inside: &inside,
-            phase: [*phase, model.shown_phases()],
+            phase: *phase,
+            n_phases: model.shown_phases(),
             rule: &rule,
             seeds: SegmentationSeeds { study, series, frame, instance, dimensions },
         };

@@ -24,6 +24,8 @@ const LOOK_EVERY: Duration = Duration::from_millis(100);
 const SENT_WITHIN: Duration = Duration::from_secs(2);
 /// Greatest number of clients.
 const MAX_CLIENTS: usize = 16;
+/// Greatest number of reads of what a client sends, between two pictures.
+const MAX_READS: usize = 16;
 /// Columns and rows of the overlay.
 const SIDE: u16 = 256;
 /// Names of the devices.
@@ -157,18 +159,21 @@ fn serve(mut stream: TcpStream, shared: &Shared) -> std::io::Result<()> {
     }
 }
 
-/// Discards what a client has sent; returns whether it is still there.
+/// Discards what a client has sent lately; returns whether it is still there.
 fn drain(stream: &mut TcpStream) -> std::io::Result<bool> {
     let mut room = [0; 4096];
     stream.set_nonblocking(true)?;
-    let there = loop {
+    let mut there = Ok(true);
+    // A client that sends without end is not listened to without end.
+    for _ in 0..MAX_READS {
         match stream.read(&mut room) {
-            Ok(0) => break Ok(false),
-            Ok(_) => {}
-            Err(error) if error.kind() == ErrorKind::WouldBlock => break Ok(true),
-            Err(error) => break Err(error),
+            Ok(0) => there = Ok(false),
+            Ok(_) => continue,
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+            Err(error) => there = Err(error),
         }
-    };
+        break;
+    }
     stream.set_nonblocking(false)?;
     there
 }

@@ -58,8 +58,9 @@ const SMALL_MISFIT: f64 = 0.12;
 const MANY_VIEWS: f64 = 4.0;
 /// Misfit from which on noise outweighs the vessels.
 const LARGE_MISFIT: f64 = 1.0;
-/// Share of the misfit that an accepted adjustment leaves at most.
-const ACCEPTED: f64 = 0.95;
+/// Share of the misfit that an accepted adjustment leaves at most. Of the data sets of `studies/degradations.toml`, those with a share of 0.80 or
+/// less gain up to 0.28 of Dice and lose at most 0.005; those with 0.84 or more lose up to 0.02 with three views.
+const ACCEPTED: f64 = 0.82;
 /// Difference of the seeds of one fit and the next.
 const NEXT_SEED: u32 = 10;
 
