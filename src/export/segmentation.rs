@@ -51,15 +51,15 @@ pub struct Segmentation<'a> {
 /// Random numbers from which the UIDs of a segmentation are made. Phases of one beat share all but the last two.
 #[derive(Debug, Clone, Copy)]
 pub struct SegmentationSeeds {
-    /// Of the study.
+    /// Seed of the study.
     pub study: u128,
-    /// Of the series.
+    /// Seed of the series.
     pub series: u128,
-    /// Of the frame of reference.
+    /// Seed of the frame of reference.
     pub frame: u128,
-    /// Of the instance.
+    /// Seed of the instance.
     pub instance: u128,
-    /// Of its dimensions.
+    /// Seed of its dimensions.
     pub dimensions: u128,
 }
 

@@ -34,7 +34,7 @@ pub struct Candidate {
     pub secondary_deg: f64,
     /// Share of the length over which the image of another vessel touches a vessel, 0 to 1.
     pub overlap: f64,
-    /// The same share among the parts that few of several fits have, each weighted by the share of the fits that lack it; none for a
+    /// Overlap among the parts that few of several fits have, each weighted by the share of the fits that lack it; none for a
     /// single fit, and where all fits agree.
     pub doubtful_overlap: Option<f64>,
     /// Share of the length that the projection loses, 0 to 1.
