@@ -1,4 +1,4 @@
-//! Messages of OpenIGTLink, header version 1 (http://openigtlink.org/developers/spec): what 3D Slicer, PLUS and robots exchange over
+//! Messages of OpenIGTLink, header version 1 (<http://openigtlink.org/developers/spec>): what 3D Slicer, PLUS and robots exchange over
 //! TCP. Coordinates are right, anterior, superior (RAS), mm.
 
 use crc::{CRC_64_ECMA_182, Crc};
