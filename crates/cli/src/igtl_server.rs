@@ -11,7 +11,7 @@ use nertca_vk::model::component::Component;
 use nertca_vk::render::quantity::{Projection, Quantity};
 use serde::Deserialize;
 use std::io::{ErrorKind, Read, Write};
-use std::net::{IpAddr, SocketAddr, TcpListener, TcpStream};
+use std::net::{IpAddr, Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
@@ -21,7 +21,7 @@ const PICTURE_EVERY: Duration = Duration::from_millis(50);
 /// Interval at which clients are accepted, and at which what is not there yet is asked for again.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// Longest time that a client may take for a message.
-const SENT_WITHIN: Duration = Duration::from_secs(2);
+const SENT_WITHIN: Duration = Duration::from_secs(10);
 /// Greatest number of clients.
 const MAX_CLIENTS: usize = 16;
 /// Greatest number of reads of what a client sends, between two pictures.
@@ -114,19 +114,22 @@ fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
             Ok((stream, from)) if shared.clients.load(Ordering::Acquire) < MAX_CLIENTS => {
                 tracing::info!("OpenIGTLink: {from} is connected");
                 shared.clients.fetch_add(1, Ordering::AcqRel);
-                let shared = shared.clone();
-                threads.push(std::thread::spawn(move || {
+                let (shared, own) = (shared.clone(), stream.try_clone());
+                let thread = std::thread::spawn(move || {
                     let why = serve(stream, &shared).err().map_or("end".into(), |error| error.to_string());
                     shared.clients.fetch_sub(1, Ordering::AcqRel);
                     tracing::info!("OpenIGTLink: {from} is disconnected: {why}");
-                }));
+                });
+                threads.push((own, thread));
             }
             Ok((_, from)) => tracing::warn!("OpenIGTLink: {from} is refused: {MAX_CLIENTS} clients are connected"),
             Err(_) => std::thread::sleep(LOOK_EVERY),
         }
-        threads.retain(|thread| !thread.is_finished());
+        threads.retain(|(_, thread)| !thread.is_finished());
     }
-    for thread in threads {
+    for (stream, thread) in threads {
+        // The end does not wait for a client that takes nothing. It may be gone already.
+        let _ = stream.map(|stream| stream.shutdown(Shutdown::Both));
         let _ = thread.join();
     }
 }
