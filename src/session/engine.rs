@@ -388,7 +388,8 @@ impl Shared {
         trainer.plan().notes.iter().for_each(|note| tracing::info!("{note}"));
         *lock(&self.calibration) = Some(calibration);
         engine.frames = dataset.training().len() as u32;
-        engine.version = version;
+        // These views are calibrated, and not adjusted yet.
+        (engine.version, engine.adjusted) = (version, 0);
         *lock(&self.taken) = taken;
         let took = started.elapsed();
         engine.settling = Some(Settling { until: Instant::now() + took * SETTLE, quiet: took.max(QUIET) });
@@ -424,11 +425,24 @@ impl Shared {
             *lock(&self.calibration) = Some(calibration);
             return Ok(AfterAdjusting::Ended);
         };
-        let plan = Plan::new(&config, &dataset)?;
+        let plan = match Plan::new(&config, &dataset) {
+            Err(why @ (Error::Config { .. } | Error::Unmet { .. } | Error::Data { .. })) => {
+                tracing::warn!(
+                    "the views stay as they are, because nothing can be fitted to the corrected ones: {why}"
+                );
+                lock(&self.engine).adjusted = version;
+                return Ok(AfterAdjusting::Ended);
+            }
+            plan => plan?,
+        };
         let mut engine = lock(&self.engine);
         self.goes_on(version)?;
-        // The state that was saved belongs to other views; the memory of its trainer is needed.
-        (engine.saved, engine.training) = (None, None);
+        // The reconstruction so far stays until the new one is saved; the memory of its trainer is needed.
+        if let Some(training) = &mut engine.training {
+            let state = training.trainer_mut().checkpoint()?;
+            engine.saved = Some(state);
+        }
+        engine.training = None;
         self.free_fields();
         let trainer = Trainer::after_adjustment(gpu, plan, &dataset, tuning, made.as_ref())?;
         engine.adjusted = version;
