@@ -102,8 +102,20 @@ pub(super) fn add_unknown(object: &mut InMemDicomObject, tag: Tag, vr: VR) {
     object.put(DataElement::new(tag, vr, PrimitiveValue::Empty));
 }
 
-/// Adds the identity of the object, the patient and the manufacturer.
-fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
+/// Identity of an object.
+pub(super) struct Identity<'a> {
+    /// UID of its class.
+    pub class: &'a str,
+    /// UIDs of the study, the series and the object.
+    pub uids: [&'a str; 3],
+    /// Its modality.
+    pub modality: &'a str,
+    /// Number of the object in its series, from 1.
+    pub number: u32,
+}
+
+/// Adds what all our objects share: the identity of the object, the patient and the manufacturer.
+pub(super) fn identify(object: &mut InMemDicomObject, identity: &Identity<'_>) {
     for (tag, vr) in [
         (tags::PATIENT_BIRTH_DATE, VR::DA),
         (tags::PATIENT_SEX, VR::CS),
@@ -112,6 +124,40 @@ fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
         (tags::REFERRING_PHYSICIAN_NAME, VR::PN),
         (tags::STUDY_ID, VR::SH),
         (tags::ACCESSION_NUMBER, VR::SH),
+    ] {
+        add_unknown(object, tag, vr);
+    }
+    let [study, series, own] = identity.uids;
+    for (tag, vr, value) in [
+        (tags::SPECIFIC_CHARACTER_SET, VR::CS, "ISO_IR 192"),
+        (tags::SOP_CLASS_UID, VR::UI, identity.class),
+        (tags::SOP_INSTANCE_UID, VR::UI, own),
+        (tags::STUDY_INSTANCE_UID, VR::UI, study),
+        (tags::SERIES_INSTANCE_UID, VR::UI, series),
+        (tags::MODALITY, VR::CS, identity.modality),
+        (tags::BODY_PART_EXAMINED, VR::CS, "HEART"),
+        (tags::PATIENT_NAME, VR::PN, "RESEARCH^RECONSTRUCTION"),
+        (tags::PATIENT_ID, VR::LO, "RESEARCH"),
+        (tags::STUDY_DESCRIPTION, VR::LO, LABEL),
+        (tags::SERIES_DESCRIPTION, VR::LO, LABEL),
+        (tags::SERIES_NUMBER, VR::IS, "1"),
+        (tags::INSTANCE_NUMBER, VR::IS, &identity.number.to_string()),
+        (tags::MANUFACTURER, VR::LO, "nertca-vk"),
+        (tags::MANUFACTURER_MODEL_NAME, VR::LO, "nertca-vk"),
+        (tags::SOFTWARE_VERSIONS, VR::LO, env!("CARGO_PKG_VERSION")),
+        (tags::BURNED_IN_ANNOTATION, VR::CS, "NO"),
+        (tags::LOSSY_IMAGE_COMPRESSION, VR::CS, "00"),
+    ] {
+        add_text(object, tag, vr, value);
+    }
+}
+
+/// Adds the identity and the description of a view.
+fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
+    let [study, series, image] = view.seeds.map(uid);
+    let class = uids::X_RAY_ANGIOGRAPHIC_IMAGE_STORAGE;
+    identify(object, &Identity { class, uids: [&study, &series, &image], modality: "XA", number: 1 });
+    for (tag, vr) in [
         (tags::PATIENT_ORIENTATION, VR::CS),
         (tags::KVP, VR::DS),
         (tags::X_RAY_TUBE_CURRENT, VR::IS),
@@ -119,30 +165,11 @@ fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
     ] {
         add_unknown(object, tag, vr);
     }
-    let [study, series, image] = view.seeds.map(uid);
     for (tag, vr, value) in [
-        (tags::SPECIFIC_CHARACTER_SET, VR::CS, "ISO_IR 192"),
-        (tags::SOP_CLASS_UID, VR::UI, uids::X_RAY_ANGIOGRAPHIC_IMAGE_STORAGE),
-        (tags::SOP_INSTANCE_UID, VR::UI, &image),
-        (tags::STUDY_INSTANCE_UID, VR::UI, &study),
-        (tags::SERIES_INSTANCE_UID, VR::UI, &series),
         (tags::IMAGE_TYPE, VR::CS, "DERIVED\\SECONDARY\\SINGLE PLANE"),
-        (tags::MODALITY, VR::CS, "XA"),
-        (tags::BODY_PART_EXAMINED, VR::CS, "HEART"),
-        (tags::PATIENT_NAME, VR::PN, "RESEARCH^RECONSTRUCTION"),
-        (tags::PATIENT_ID, VR::LO, "RESEARCH"),
-        (tags::STUDY_DESCRIPTION, VR::LO, LABEL),
-        (tags::SERIES_DESCRIPTION, VR::LO, LABEL),
-        (tags::SERIES_NUMBER, VR::IS, "1"),
-        (tags::INSTANCE_NUMBER, VR::IS, "1"),
         (tags::IMAGE_COMMENTS, VR::LT, LABEL),
         (tags::DERIVATION_DESCRIPTION, VR::ST, &format!("{LABEL}. {}", view.description)),
-        (tags::MANUFACTURER, VR::LO, "nertca-vk"),
-        (tags::MANUFACTURER_MODEL_NAME, VR::LO, "nertca-vk"),
-        (tags::SOFTWARE_VERSIONS, VR::LO, env!("CARGO_PKG_VERSION")),
         (tags::RADIATION_SETTING, VR::CS, "GR"),
-        (tags::BURNED_IN_ANNOTATION, VR::CS, "NO"),
-        (tags::LOSSY_IMAGE_COMPRESSION, VR::CS, "00"),
         (tags::PATIENT_POSITION, VR::CS, "HFS"),
     ] {
         add_text(object, tag, vr, value);

@@ -4,12 +4,13 @@
 //! There are no references to source runs, because a dataset contains none of their UIDs.
 
 use crate::error::{Error, Result};
-use crate::export::dicom::{LABEL, add_text, add_unknown, decimal, uid, write_object};
+use crate::export::dicom::{Identity, LABEL, add_text, add_unknown, decimal, identify, uid, write_object};
 use crate::render::grid::PatientGrid;
 use dicom_core::chrono::{DateTime, Utc};
 use dicom_core::value::DataSetSequence;
 use dicom_core::{DataElement, PrimitiveValue, Tag, VR};
-use dicom_dictionary_std::{tags, uids};
+use dicom_dictionary_std::tags;
+use dicom_dictionary_std::uids::SEGMENTATION_STORAGE;
 use dicom_object::InMemDicomObject;
 use std::path::Path;
 use std::time::SystemTime;
@@ -128,52 +129,25 @@ fn code(code: &Code) -> InMemDicomObject {
     item
 }
 
-/// Adds the identity of the object, the patient and the manufacturer.
+/// Adds the identity and the description of a segmentation.
 fn describe(object: &mut InMemDicomObject, segmentation: &Segmentation<'_>) {
-    for (tag, vr) in [
-        (tags::PATIENT_BIRTH_DATE, VR::DA),
-        (tags::PATIENT_SEX, VR::CS),
-        (tags::STUDY_DATE, VR::DA),
-        (tags::STUDY_TIME, VR::TM),
-        (tags::REFERRING_PHYSICIAN_NAME, VR::PN),
-        (tags::STUDY_ID, VR::SH),
-        (tags::ACCESSION_NUMBER, VR::SH),
-        (tags::POSITION_REFERENCE_INDICATOR, VR::LO),
-        (tags::CONTENT_CREATOR_NAME, VR::PN),
-    ] {
-        add_unknown(object, tag, vr);
-    }
     let SegmentationSeeds { study, series, frame, instance, .. } = segmentation.seeds;
     let [study, series, frame, instance] = [study, series, frame, instance].map(uid);
     let Segmentation { phase, n_phases, .. } = segmentation;
+    let uids = [study.as_str(), &series, &instance];
+    identify(object, &Identity { class: SEGMENTATION_STORAGE, uids, modality: "SEG", number: phase + 1 });
+    add_unknown(object, tags::POSITION_REFERENCE_INDICATOR, VR::LO);
+    add_unknown(object, tags::CONTENT_CREATOR_NAME, VR::PN);
     let now = DateTime::<Utc>::from(SystemTime::now());
     for (tag, vr, value) in [
-        (tags::SPECIFIC_CHARACTER_SET, VR::CS, "ISO_IR 192"),
-        (tags::SOP_CLASS_UID, VR::UI, uids::SEGMENTATION_STORAGE),
-        (tags::SOP_INSTANCE_UID, VR::UI, &instance),
-        (tags::STUDY_INSTANCE_UID, VR::UI, &study),
-        (tags::SERIES_INSTANCE_UID, VR::UI, &series),
-        (tags::FRAME_OF_REFERENCE_UID, VR::UI, &frame),
+        (tags::FRAME_OF_REFERENCE_UID, VR::UI, frame.as_str()),
         (tags::IMAGE_TYPE, VR::CS, "DERIVED\\PRIMARY"),
-        (tags::MODALITY, VR::CS, "SEG"),
-        (tags::BODY_PART_EXAMINED, VR::CS, "HEART"),
-        (tags::PATIENT_NAME, VR::PN, "RESEARCH^RECONSTRUCTION"),
-        (tags::PATIENT_ID, VR::LO, "RESEARCH"),
-        (tags::STUDY_DESCRIPTION, VR::LO, LABEL),
-        (tags::SERIES_DESCRIPTION, VR::LO, LABEL),
-        (tags::SERIES_NUMBER, VR::IS, "1"),
-        (tags::INSTANCE_NUMBER, VR::IS, &(phase + 1).to_string()),
         (tags::CONTENT_DATE, VR::DA, &now.format("%Y%m%d").to_string()),
         (tags::CONTENT_TIME, VR::TM, &now.format("%H%M%S").to_string()),
         (tags::CONTENT_LABEL, VR::CS, "VESSELS"),
         (tags::CONTENT_DESCRIPTION, VR::LO, &format!("Phase {phase} of {n_phases}, not for diagnosis")),
-        (tags::MANUFACTURER, VR::LO, "nertca-vk"),
-        (tags::MANUFACTURER_MODEL_NAME, VR::LO, "nertca-vk"),
         (tags::DEVICE_SERIAL_NUMBER, VR::LO, "0"),
-        (tags::SOFTWARE_VERSIONS, VR::LO, env!("CARGO_PKG_VERSION")),
         (tags::PHOTOMETRIC_INTERPRETATION, VR::CS, "MONOCHROME2"),
-        (tags::BURNED_IN_ANNOTATION, VR::CS, "NO"),
-        (tags::LOSSY_IMAGE_COMPRESSION, VR::CS, "00"),
         (tags::SEGMENTATION_TYPE, VR::CS, "BINARY"),
         (tags::SEGMENTS_OVERLAP, VR::CS, "NO"),
     ] {

@@ -21,6 +21,7 @@ use nertca_vk::scan::dataset::{Dataset, Layout, Split};
 pub use nertca_vk::selftest::compare::relative_error;
 use nertca_vk::selftest::compare::{Findings, Row};
 use nertca_vk::selftest::problems;
+use nertca_vk::session::{FrameTime, NewFrame, Session};
 use nertca_vk::train::trainer::Trainer;
 use std::num::NonZeroU32;
 use std::path::Path;
@@ -111,4 +112,20 @@ pub fn whiten(dataset: &mut Dataset, deviation: f64) {
 pub fn drop_first_view(dataset: &mut Dataset) {
     let first = dataset.training_views()[0];
     dataset.frames.retain(|f| f.split == Split::Validation || f.view != first);
+}
+
+/// Adds the training frames of a dataset to a session, at their phases.
+pub fn add_training_frames(session: &Session, dataset: &Dataset) {
+    for frame in dataset.training() {
+        let new = NewFrame {
+            geometry: dataset.views[frame.view].geometry.clone(),
+            moment: FrameTime::Phase(frame.phase),
+            split: frame.split,
+            width: dataset.width,
+            height: dataset.height,
+            integrals: frame.integrals.to_vec(),
+            mask: None,
+        };
+        session.add_frame(new).unwrap();
+    }
 }

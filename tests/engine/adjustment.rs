@@ -1,6 +1,6 @@
 //! Adjustment of views with the field of a fit in the loop: columns against f64 twins, planted errors of poses, whole adjustments.
 
-use crate::common::{expect_silence, gpu, run, tuning};
+use crate::common::{add_training_frames, expect_silence, gpu, run, tuning};
 use crate::disagreeing::{PHASES, Shot, Studio, Wrong};
 use glam::DVec3;
 use nertca_vk::calibrate::correction::Calibration;
@@ -23,7 +23,7 @@ use nertca_vk::methods::dynamic_gaussians::targets::Targets;
 use nertca_vk::plan::Plan;
 use nertca_vk::reference::gaussians::{params, project};
 use nertca_vk::scan::dataset::Dataset;
-use nertca_vk::session::{FrameTime, NewFrame, Progress, Session, SessionOptions, State};
+use nertca_vk::session::{Progress, Session, SessionOptions, State};
 use nertca_vk::train::trainer::Trainer;
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
@@ -251,18 +251,7 @@ pub fn session(gpu: &Gpu, shot: &Shot) -> Session {
         deterministic: true,
     };
     let session = Session::new(Some(gpu.clone()), Some(tuning(gpu)), options).unwrap();
-    for frame in dataset.training() {
-        let new = NewFrame {
-            geometry: dataset.views[frame.view].geometry.clone(),
-            moment: FrameTime::Phase(frame.phase),
-            split: frame.split,
-            width: dataset.width,
-            height: dataset.height,
-            integrals: frame.integrals.to_vec(),
-            mask: None,
-        };
-        session.add_frame(new).unwrap();
-    }
+    add_training_frames(&session, dataset);
     session
 }
 

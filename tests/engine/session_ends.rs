@@ -1,8 +1,8 @@
 //! The end of training in the background, as seen by waiting threads: training may restart at once, however long its thread
 //! takes to exit.
 
-use crate::common::{expect_silence, gpu, small_config, small_dataset, tuning};
-use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions, State};
+use crate::common::{add_training_frames, expect_silence, gpu, small_config, small_dataset, tuning};
+use nertca_vk::session::{Session, SessionOptions, State};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -49,18 +49,7 @@ fn who_waited_for_the_end_may_start_and_train_at_once() {
         deterministic: true,
     };
     let session = Session::new(Some(gpu.clone()), Some(tuning(&gpu)), options).unwrap();
-    for frame in dataset.training() {
-        let new = NewFrame {
-            geometry: dataset.views[frame.view].geometry.clone(),
-            moment: FrameTime::Phase(frame.phase),
-            split: frame.split,
-            width: dataset.width,
-            height: dataset.height,
-            integrals: frame.integrals.to_vec(),
-            mask: None,
-        };
-        session.add_frame(new).unwrap();
-    }
+    add_training_frames(&session, &dataset);
     for again in [start, train] {
         let gone = Arc::new(AtomicBool::new(false));
         // The thread keeps the log of its creator, and drops it last.
