@@ -159,9 +159,16 @@ fn links_stay(run: &Path, directory: &Path) {
 #[cfg(not(unix))]
 fn links_stay(_: &Path, _: &Path) {}
 
-/// A signal ends an export and removes what it was writing.
+/// A signal ends an export and removes what it was writing, also while threads of a driver work. Several attempts are made, because
+/// such a thread uses what exit handlers free only sometimes.
 #[cfg(unix)]
 fn signals_leave_nothing(run: &Path, directory: &Path) {
+    const ATTEMPTS: usize = 8;
+    (0..ATTEMPTS).for_each(|_| a_signal_leaves_nothing(run, directory));
+}
+
+#[cfg(unix)]
+fn a_signal_leaves_nothing(run: &Path, directory: &Path) {
     let out = directory.join("large");
     let partial = || {
         let listed = std::fs::read_dir(&out).into_iter().flatten().flatten();

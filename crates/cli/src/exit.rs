@@ -1,6 +1,7 @@
 //! Exit codes of the program, and hints after an error.
 
 use nertca_vk::error::{Error, SMALLER_BATCHES};
+use nertca_vk::files;
 
 /// Exit code for a command or an option that is not usable.
 const USAGE: u8 = 2;
@@ -10,6 +11,19 @@ const NO_DEVICE: u8 = 3;
 pub const TRY_AGAIN: u8 = 75;
 /// Exit code after a stop by Ctrl-C or SIGTERM; the work done is saved.
 pub const INTERRUPTED: u8 = 130;
+
+/// Ends the process at once, with the exit code of a stop and without partial files, while other threads still work.
+pub fn interrupted() -> ! {
+    files::remove_unfinished();
+    #[cfg(unix)]
+    // SAFETY: the function takes a number and does not return. It calls no exit handlers, which is why it is called: those of a
+    // driver free what the threads of the driver still use, and the process would die of a segmentation fault.
+    unsafe {
+        libc::_exit(i32::from(INTERRUPTED))
+    }
+    #[cfg(not(unix))]
+    std::process::exit(i32::from(INTERRUPTED))
+}
 
 /// Returns the exit code of an error; 1 for errors without a code of their own.
 pub fn code(error: &Error) -> u8 {

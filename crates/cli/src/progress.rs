@@ -3,7 +3,6 @@
 use super::stdout::printable;
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::error::{Error, Result};
-use nertca_vk::files;
 use nertca_vk::fitting::losses::LargeLoss;
 use nertca_vk::run::events::Event;
 use std::io::IsTerminal;
@@ -19,8 +18,7 @@ pub fn stop_flag() -> Result<Arc<AtomicBool>> {
     let seen = stop.clone();
     ctrlc::set_handler(move || {
         if seen.swap(true, Ordering::Relaxed) {
-            files::remove_unfinished();
-            std::process::exit(i32::from(super::exit::INTERRUPTED));
+            super::exit::interrupted();
         }
         eprintln!("nertca-vk: the program will stop after the current work; press Ctrl-C again to stop immediately");
     })
@@ -31,11 +29,8 @@ pub fn stop_flag() -> Result<Arc<AtomicBool>> {
 /// Makes Ctrl-C and SIGTERM end the program at once, after what it is writing has been removed. For commands without work that
 /// could be continued.
 pub fn clean_up_on_signals() -> Result<()> {
-    ctrlc::set_handler(|| {
-        files::remove_unfinished();
-        std::process::exit(i32::from(super::exit::INTERRUPTED));
-    })
-    .map_err(|e| Error::Internal(format!("the Ctrl-C handler could not be set: {e}")))
+    ctrlc::set_handler(|| super::exit::interrupted())
+        .map_err(|e| Error::Internal(format!("the Ctrl-C handler could not be set: {e}")))
 }
 
 /// Prints an event as one line of JSON on stdout.
