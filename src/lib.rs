@@ -153,6 +153,7 @@ pub mod evidence {
     pub mod background;
     pub mod drift;
     mod filters;
+    mod interiors;
     pub mod noise;
     pub mod ratios;
     pub mod series;

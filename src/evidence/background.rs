@@ -2,6 +2,7 @@
 
 use crate::evidence::drift::Drift;
 use crate::evidence::filters::map2;
+use crate::evidence::interiors::{Interiors, Levels, interiors};
 use crate::evidence::noise::{expected_minimum, noise_by_intensity};
 use crate::evidence::series::{MIN_NOISE_SHARE, Series, blur, opening_radius};
 use crate::raster::{Image, dilate, median, opening, percentile};
@@ -92,22 +93,26 @@ impl Background {
             .into_par_iter()
             .map(|p| lower_mode(&images.iter().map(|i| i.values[p]).collect::<Vec<_>>(), noise[p].max(min), bias))
             .collect();
-        let level = image(level);
+        let mut level = image(level);
+        // An opening of noise has a negative bias, an opening of the smoothed background a much smaller one.
+        let narrow = opening_radius(OPENING_SHARE, width, height);
+        let mut low = opening(&blur(&level, STRONGEST_BLUR), narrow);
         let wide = opening_radius(WIDE_SHARE, width, height);
-        let changes: Vec<Option<Image>> =
-            stilled.images.par_iter().map(|seen| Some(narrow_change(seen.as_ref()?, &level, wide))).collect();
-        let largest = changes.par_iter().flatten().map(|c| blur(c, STRONGEST_BLUR).values).reduce(
-            || vec![f32::MIN; width * height],
-            |mut max, values| {
-                max.iter_mut().zip(values).for_each(|(max, value)| *max = max.max(value));
-                max
-            },
-        );
-        let strongest = percentile(&largest, STRONGEST_PERCENTILE);
+        let mut changes = stilled.changes(&level, wide, None);
+        let mut largest = largest_change(&changes, width, height);
+        let mut strongest = percentile(&largest.values, STRONGEST_PERCENTILE);
+        let levels = Levels { low: &low, radius: narrow, largest: &largest, strongest, noise: &noise };
+        if let Some(Interiors { inside, background }) = interiors(&levels) {
+            for pixel in (0..width * height).filter(|pixel| inside[*pixel]) {
+                level.values[pixel] = level.values[pixel].min(background.values[pixel]);
+                low.values[pixel] = low.values[pixel].min(background.values[pixel]);
+            }
+            changes = stilled.changes(&level, wide, Some(&inside));
+            largest = largest_change(&changes, width, height);
+            strongest = percentile(&largest.values, STRONGEST_PERCENTILE);
+        }
         let floor = (MIN_NOISE_SHARE * strongest).max(f32::MIN_POSITIVE);
         noise.iter_mut().for_each(|s| *s = s.max(floor));
-        // An opening of noise has a negative bias, an opening of the smoothed background a much smaller one.
-        let mut low = opening(&blur(&level, STRONGEST_BLUR), opening_radius(OPENING_SHARE, width, height));
         low.values.iter_mut().zip(&level.values).for_each(|(low, b)| *low = low.min(*b));
         Background { level, low, changes, noise: image(noise), strongest, drift, stilled }
     }
@@ -126,11 +131,34 @@ impl Background {
     }
 }
 
-/// Change above the level, minus its wide part: the part that an opening by `radius` retains.
-fn narrow_change(seen: &Image, level: &Image, radius: usize) -> Image {
-    let change = map2(seen, level, |y, b| y - b);
-    let wide = opening(&blur(&change, STRONGEST_BLUR), radius);
-    map2(&change, &wide, |d, wide| d - wide.max(0.0))
+impl Series {
+    /// Returns the change of each image above the level, without its wide part: the part that an opening by `radius` retains. Where a
+    /// wide vessel is, its change stays whole.
+    fn changes(&self, level: &Image, radius: usize, of_wide_vessels: Option<&[bool]>) -> Vec<Option<Image>> {
+        let change = |seen: &Image| {
+            let change = map2(seen, level, |y, b| y - b);
+            let mut wide = opening(&blur(&change, STRONGEST_BLUR), radius);
+            for (wide, _) in
+                wide.values.iter_mut().zip(of_wide_vessels.unwrap_or_default()).filter(|(_, inside)| **inside)
+            {
+                *wide = 0.0;
+            }
+            map2(&change, &wide, |d, wide| d - wide.max(0.0))
+        };
+        self.images.par_iter().map(|seen| seen.as_ref().map(change)).collect()
+    }
+}
+
+/// Returns the largest change of each pixel over the phases, slightly blurred.
+fn largest_change(changes: &[Option<Image>], width: usize, height: usize) -> Image {
+    let values = changes.par_iter().flatten().map(|c| blur(c, STRONGEST_BLUR).values).reduce(
+        || vec![f32::MIN; width * height],
+        |mut max, values| {
+            max.iter_mut().zip(values).for_each(|(max, value)| *max = max.max(value));
+            max
+        },
+    );
+    Image { width, height, values }
 }
 
 /// Maximum within `radius` pixels along both axes.

@@ -14,7 +14,7 @@ use crate::trees::graph::Forest;
 use crate::trees::radii::Lumen;
 use crate::trees::refine::{Centring, STEP, evenly, from_voxels};
 use crate::trees::sampled::SampledField;
-use crate::trees::solid::filled;
+use crate::trees::solid::make_solid;
 use crate::trees::tidy::{bridge_gaps, drop_specks, prune_spurs};
 use crate::trees::tree::{BeatTree, Branch, PhaseTree};
 use crate::vessels::centreline::centreline;
@@ -168,12 +168,18 @@ impl Finder<'_> {
     fn tree(&mut self, phase: u32) -> Result<PhaseTree> {
         let field = self.vessel_field(phase);
         let boxes = field.boxes(&field.coarse()?);
-        let field = self.field(phase, &boxes)?.ok_or_else(|| self.no_vessels(phase))?;
-        let lines = centrelines(&field, self.threshold_per_mm, self.resolution_mm, self.least_branch_mm);
+        let mut field = self.field(phase, &boxes)?.ok_or_else(|| self.no_vessels(phase))?;
+        let vessels = make_solid(&mut field, self.threshold_per_mm, self.resolution_mm, self.vessel_per_mm());
+        let lines = centrelines(&field, &vessels, self.resolution_mm, self.least_branch_mm);
         if lines.is_empty() {
             return Err(self.no_vessels(phase));
         }
         Ok(PhaseTree { phase, branches: self.measured(&field, lines, phase) })
+    }
+
+    /// Returns the attenuation inside vessels, where it is known.
+    fn vessel_per_mm(&self) -> Option<f64> {
+        self.model.vessel_attenuation.map(|attenuation| attenuation / MM_PER_UNIT)
     }
 
     /// Moves the tree of the reference phase to another phase. A material point keeps its radius.
@@ -207,8 +213,7 @@ impl Finder<'_> {
 
     /// Measures the radii of the vessels along lines at a phase, and how far repeated fits agree on them.
     fn measured(&self, field: &SampledField, lines: Vec<Line>, phase: u32) -> Vec<Branch> {
-        let vessel_per_mm = self.model.vessel_attenuation.map(|attenuation| attenuation / MM_PER_UNIT);
-        let lumen = Lumen { field, resolution_mm: self.resolution_mm, vessel_per_mm };
+        let lumen = Lumen { field, resolution_mm: self.resolution_mm, vessel_per_mm: self.vessel_per_mm() };
         let branch = |Line { parent, points_mm }: Line| {
             let radius_mm = lumen.radii_mm(&points_mm);
             let agreement = self.agreement(&points_mm, phase);
@@ -224,9 +229,9 @@ struct Line {
     points_mm: Vec<DVec3>,
 }
 
-/// Centrelines of a field where it exceeds a threshold, each after its parent.
-fn centrelines(field: &SampledField, threshold_per_mm: f64, resolution_mm: f64, least_branch_mm: f64) -> Vec<Line> {
-    let mut forest = thinned(field, threshold_per_mm, resolution_mm);
+/// Centrelines of the vessels of a field, each after its parent.
+fn centrelines(field: &SampledField, vessels: &Mask, resolution_mm: f64, least_branch_mm: f64) -> Vec<Line> {
+    let mut forest = thinned(field, vessels);
     bridge_gaps(&mut forest, resolution_mm);
     prune_spurs(&mut forest, least_branch_mm);
     drop_specks(&mut forest, least_branch_mm);
@@ -245,13 +250,10 @@ fn centrelines(field: &SampledField, threshold_per_mm: f64, resolution_mm: f64, 
     lines
 }
 
-/// Thins a field, where it exceeds a threshold, to a forest of lines one voxel wide.
-fn thinned(field: &SampledField, threshold_per_mm: f64, resolution_mm: f64) -> Forest {
-    let inside: Vec<bool> = field.values.iter().map(|v| f64::from(*v) > threshold_per_mm).collect();
-    let (size, spacing_mm) = (field.grid.size.map(|n| n as usize), field.grid.spacing_mm);
-    let solid = filled(&Mask { size, spacing_mm, inside }, resolution_mm);
-    let to_outside = DistanceMap::to(&solid.complement());
-    let line = centreline(&solid);
+/// Thins the vessels of a field to a forest of lines one voxel wide.
+fn thinned(field: &SampledField, vessels: &Mask) -> Forest {
+    let to_outside = DistanceMap::to(&vessels.complement());
+    let line = centreline(vessels);
     Forest::of(&line, field, |voxel| to_outside.as_ref().map_or(0.0, |map| f64::from(map.at_mm(voxel))))
 }
 
@@ -262,7 +264,12 @@ mod tests {
     use std::f64::consts::TAU;
 
     fn found(tubes: &[Tube]) -> Vec<Line> {
-        centrelines(&vessels(tubes), 0.2 * VESSEL_PER_MM, RESOLUTION_MM, MIN_BRANCH * RESOLUTION_MM)
+        found_in(&mut vessels(tubes))
+    }
+
+    fn found_in(field: &mut SampledField) -> Vec<Line> {
+        let vessels = make_solid(field, 0.2 * VESSEL_PER_MM, RESOLUTION_MM, Some(VESSEL_PER_MM));
+        centrelines(field, &vessels, RESOLUTION_MM, MIN_BRANCH * RESOLUTION_MM)
     }
 
     /// Maximum distance of a line's points from the nearest true point, mm.
@@ -347,15 +354,18 @@ mod tests {
     fn a_straight_tube_of_any_width_is_one_line() {
         let tube =
             |radius_mm: f64, half_mm: f64| (points(300, |along| DVec3::X * half_mm * (2.0 * along - 1.0)), radius_mm);
-        let of =
-            |field: &SampledField| centrelines(field, 0.2 * VESSEL_PER_MM, RESOLUTION_MM, MIN_BRANCH * RESOLUTION_MM);
         // Diameters: a grid step, 4 mm, 16 mm.
         for (radius_mm, half_mm) in [(0.25, 18.0), (2.0, 17.0), (8.0, 11.0)] {
-            let lines = of(&vessels(&[tube(radius_mm, half_mm)]));
+            let lines = found(&[tube(radius_mm, half_mm)]);
             assert_eq!(lines.len(), 1, "radius {radius_mm} mm");
         }
-        let lines = of(&uneven(&[tube(8.0, 11.0)]));
-        assert!(lines.len() <= 3, "{} lines of an uneven field", lines.len());
+        let mut field = uneven(&[tube(8.0, 11.0)]);
+        let lines = found_in(&mut field);
+        assert_eq!(lines.len(), 1, "lines of an uneven field");
+        let lumen = Lumen { field: &field, resolution_mm: RESOLUTION_MM, vessel_per_mm: Some(VESSEL_PER_MM) };
+        let radii_mm = lumen.radii_mm(&lines[0].points_mm);
+        let middle = &radii_mm[radii_mm.len() / 4..radii_mm.len() * 3 / 4];
+        assert!(middle.iter().all(|radius| (radius / 8.0 - 1.0).abs() < 0.1), "{middle:?} mm");
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! Filling of thick vessels: a field that is fitted to a vessel much wider than its resolution is uneven inside, and holes and tunnels in it
 //! would become branches of the centreline.
 
+use crate::raster::percentile;
+use crate::trees::sampled::SampledField;
 use crate::vessels::distances::DistanceMap;
 use crate::vessels::mask::Mask;
 
@@ -8,10 +10,21 @@ use crate::vessels::mask::Mask;
 const HOLE: f64 = 2.0;
 /// Radius of the smallest ball that a thick vessel holds once its holes are closed, in units of the field's resolution.
 const THICK: f64 = 2.5;
+/// Percentile of the field inside thick vessels that is taken as their attenuation where it is not known.
+const LEVEL_PERCENTILE: f64 = 0.75;
 
-/// Returns a set of voxels with the holes of its thick parts, and all cavities, filled. A part is thick if it holds a ball of [`THICK`] once
-/// holes are closed; gaps between thin vessels hold none, and stay open.
-pub(super) fn filled(mask: &Mask, resolution_mm: f64) -> Mask {
+/// A set of voxels whose thick parts are solid.
+#[derive(Debug, PartialEq)]
+struct Solid {
+    /// The set with the holes of its thick parts, and all cavities, filled.
+    mask: Mask,
+    /// Voxels of thick parts that lie deeper inside than the resolution.
+    interior: Vec<bool>,
+}
+
+/// Fills a set of voxels. A part is thick if it holds a ball of [`THICK`] once holes are closed; gaps between thin vessels hold none, and
+/// stay open.
+fn solid(mask: &Mask, resolution_mm: f64) -> Solid {
     let (hole_mm, thick_mm) = (HOLE * resolution_mm, THICK * resolution_mm);
     let margin = mask.spacing_mm.to_array().map(|step| (hole_mm / step).ceil() as usize + 1);
     let wide = framed(mask, margin);
@@ -19,11 +32,36 @@ pub(super) fn filled(mask: &Mask, resolution_mm: f64) -> Mask {
     closed = within(&closed, hole_mm).complement();
     let core = within(&closed.complement(), thick_mm).complement();
     let thick = within(&core, thick_mm);
-    let solid = Mask {
+    let filled = Mask {
         inside: (0..wide.inside.len()).map(|v| wide.inside[v] || closed.inside[v] && thick.inside[v]).collect(),
         ..wide
     };
-    unframed(&without_cavities(solid), mask, margin)
+    let filled = without_cavities(filled);
+    let deep = within(&filled.complement(), resolution_mm).complement();
+    let interior =
+        Mask { inside: deep.inside.iter().zip(&thick.inside).map(|(deep, thick)| *deep && *thick).collect(), ..deep };
+    Solid { mask: unframed(&filled, mask, margin), interior: unframed(&interior, mask, margin).inside }
+}
+
+/// Makes the thick vessels of a field solid, and returns the voxels of all vessels. Without it, centrelines and radii of a thick vessel would
+/// follow the lumps of the field. The interior gets the attenuation of vessels where it is known, and a high percentile of the field inside
+/// thick vessels otherwise.
+pub(super) fn make_solid(
+    field: &mut SampledField,
+    threshold_per_mm: f64,
+    resolution_mm: f64,
+    vessel_per_mm: Option<f64>,
+) -> Mask {
+    let inside: Vec<bool> = field.values.iter().map(|v| f64::from(*v) > threshold_per_mm).collect();
+    let (size, spacing_mm) = (field.grid.size.map(|n| n as usize), field.grid.spacing_mm);
+    let Solid { mask, interior } = solid(&Mask { size, spacing_mm, inside }, resolution_mm);
+    let interior: Vec<usize> = (0..interior.len()).filter(|voxel| interior[*voxel]).collect();
+    let level = vessel_per_mm.map_or_else(
+        || percentile(&interior.iter().map(|voxel| field.values[*voxel]).collect::<Vec<_>>(), LEVEL_PERCENTILE),
+        |per_mm| per_mm as f32,
+    );
+    interior.into_iter().for_each(|voxel| field.values[voxel] = level);
+    mask
 }
 
 /// Returns the voxels within a distance of a set.
@@ -101,11 +139,20 @@ mod tests {
             p.distance(DVec3::new(17.0, 21.0, 15.0)) < 2.5 || (p - DVec3::new(p.x, 20.0, 30.0)).length() < 2.5
         };
         let holed = drawn([41, 41, 50], SPACING_MM, |p| is_in_tube(p, 10.0) && !is_hole(p));
-        let filled = filled(&holed, RESOLUTION_MM);
+        let Solid { mask: filled, interior } = solid(&holed, RESOLUTION_MM);
         assert!(holed.voxels().all(|voxel| filled.inside[voxel]), "nothing is removed");
         let missing = tube(8.0).voxels().filter(|voxel| !filled.inside[*voxel]).count();
         let beyond = filled.voxels().filter(|voxel| !tube(10.0).inside[*voxel]).count();
         assert_eq!((missing, beyond), (0, 0));
+        let depths_mm = DistanceMap::to(&filled.complement()).unwrap();
+        let is_deep = |voxel: usize| f64::from(depths_mm.at_mm(voxel)) > RESOLUTION_MM;
+        assert!(tube(7.0).voxels().filter(|voxel| is_deep(*voxel)).count() > 5000);
+        assert!((0..interior.len()).all(|voxel| !interior[voxel] || is_deep(voxel)), "the rim is not interior");
+        assert!(tube(7.0).voxels().all(|voxel| interior[voxel] == is_deep(voxel)));
+    }
+
+    fn as_it_is(mask: &Mask) -> Solid {
+        Solid { mask: mask.clone(), interior: vec![false; mask.inside.len()] }
     }
 
     #[test]
@@ -114,13 +161,13 @@ mod tests {
         let beside = drawn([41, 41, 50], SPACING_MM, |p| {
             is_in_tube(p + 3.0 * DVec3::X, 2.0) || is_in_tube(p - 3.0 * DVec3::X, 2.0)
         });
-        assert_eq!(filled(&beside, RESOLUTION_MM), beside);
+        assert_eq!(solid(&beside, RESOLUTION_MM), as_it_is(&beside));
         let ring = drawn([41, 41, 20], SPACING_MM, |p| {
             let away = (p - DVec3::new(20.0, 20.0, p.z)).length() - 6.0;
             away.hypot(p.z - 10.0) < 2.0
         });
-        assert_eq!(filled(&ring, RESOLUTION_MM), ring);
+        assert_eq!(solid(&ring, RESOLUTION_MM), as_it_is(&ring));
         let nothing = drawn([5, 5, 5], SPACING_MM, |_| false);
-        assert_eq!(filled(&nothing, RESOLUTION_MM), nothing);
+        assert_eq!(solid(&nothing, RESOLUTION_MM), as_it_is(&nothing));
     }
 }

@@ -56,7 +56,7 @@ fn bridges_from(forest: &Forest, end: usize, resolution_mm: f64) -> Vec<Bridge> 
 }
 
 /// Share of the radius of a vessel that a branch must reach beyond its lumen: a bump of a thick vessel is no branch.
-const BUMP: f64 = 0.5;
+const BUMP: f64 = 1.0;
 
 /// Prunes branches with an end that reach less than `least_mm` beyond the lumen of the vessel they leave, or less than a share of its
 /// radius, the shortest first.

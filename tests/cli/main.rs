@@ -50,3 +50,4 @@ mod volume_scores;
 mod watch;
 mod ways_in;
 mod ways_out;
+mod wide_vessels;

@@ -181,9 +181,12 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     earlier.make_way(&made)?;
     made.iter().for_each(|path| out!("{}", path.display()));
     for tree in &beat.phases {
-        let doubt = tree.doubtful_mm().map_or(String::new(), |mm| {
-            format!("; less than {:.0} % of the other fits have {mm:.1} mm of it, which may be false", 100.0 * DOUBTFUL)
-        });
+        let share = format!("{:.0} % of the other fits", 100.0 * DOUBTFUL);
+        let doubt = match tree.doubtful_mm() {
+            None => String::new(),
+            Some(0.0) => format!("; at least {share} have all of it"),
+            Some(mm) => format!("; less than {share} have {mm:.1} mm of it, which may be false"),
+        };
         eprintln!(
             "phase {}: {:.1} mm in {} branches, components: {}{doubt}",
             tree.phase,

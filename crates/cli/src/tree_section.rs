@@ -139,7 +139,7 @@ fn table(beat: &BeatTree, name: &str, tree: &PhaseTree) -> Markup {
                 tr { td { "all" } td {} td { (format!("{:.1}", tree.length_mm())) } td {} td {} @if is_mean { td {} } }
             }
             (lesion_section::section(beat, tree))
-            @if let Some(mm) = tree.doubtful_mm() {
+            @if let Some(mm) = tree.doubtful_mm().filter(|mm| *mm > 0.0) {
                 p { "The field is the mean of several fits. \"Other fits\" is the share of them that have a vessel there. Less than "
                     (format!("{:.0}", 100.0 * DOUBTFUL)) " % of them have " (format!("{mm:.1}")) " mm of this tree, which may be false." }
             }
