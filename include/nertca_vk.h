@@ -736,6 +736,21 @@ typedef struct {
    * Radius of the vessel at each point, mm.
    */
   double *radius_mm;
+  /**
+   * Half width of the interval that contains the true centreline with a probability of 68 %, along the least certain direction across the
+   * vessel, for each point, mm. This array and the next two may be null, and have room for `points` elements otherwise. They hold NaN where
+   * the reconstruction has no frames to compare with, as after a checkpoint was loaded.
+   */
+  double *doubt_mm;
+  /**
+   * Half width for the material point, mm, which also holds its motion along the vessel, which no view tells; NaN where points are not
+   * followed.
+   */
+  double *doubt_with_motion_mm;
+  /**
+   * Probability that a true vessel is within 3 mm of each point, 0 to 1.
+   */
+  double *existence;
 } nertca_tree;
 
 /**

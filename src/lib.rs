@@ -239,6 +239,7 @@ pub mod vessels {
 /// Vessels as trees of centrelines with radii, followed over the beat.
 pub mod trees {
     mod branches;
+    pub mod doubt;
     pub mod extract;
     pub mod files;
     mod follow;
@@ -247,6 +248,7 @@ pub mod trees {
     pub mod next_view;
     mod radii;
     mod refine;
+    mod ridges;
     mod sampled;
     pub mod sight;
     mod solid;

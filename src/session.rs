@@ -28,8 +28,9 @@ use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::at_rest;
 use crate::scan::gating::{BeatTime, RPeaks};
 use crate::scan::prior::VesselPrior;
+use crate::trees::doubt::state_doubt;
 use crate::trees::extract::{TreeOptions, vessel_trees};
-use crate::trees::tree::BeatTree;
+use crate::trees::tree::{BeatTree, TreeView};
 pub use corrected::CorrectedFrame;
 pub use engine::Drawn;
 use engine::{Control, Shared, lock, nothing_yet};
@@ -523,7 +524,25 @@ impl Session {
         let interlude = LongWork::interlude(gpu, &Arc::new(Mutex::new(call.clone())));
         let renderer = Renderer::new(gpu, &model, tuning.clone())?.in_slices(interlude);
         let phases = (0..model.shown_phases()).collect();
-        vessel_trees(&renderer, &model, &TreeOptions { phases, threshold_per_mm, least_branch_mm }, |_, _| call.check())
+        let options = TreeOptions { phases, threshold_per_mm, least_branch_mm };
+        let mut beat = vessel_trees(&renderer, &model, &options, |_, _| call.check())?;
+        self.compare_with_images(&mut beat);
+        Ok(beat)
+    }
+
+    /// States in a tree of the session the doubt about each point ([`crate::trees::doubt`]) and the training views, if training has begun
+    /// here. A reason against it is logged.
+    pub fn compare_with_images(&self, beat: &mut BeatTree) {
+        let Some(calibration) = self.calibration() else { return };
+        let dataset = lock(&self.shared.inbox).training_dataset();
+        match dataset.and_then(|(dataset, _)| dataset.corrected(&calibration)) {
+            Ok(dataset) if dataset.n_phases as usize == beat.phases.len() => {
+                beat.views = TreeView::of(&dataset);
+                state_doubt(beat, &dataset, calibration.disagreement_px);
+            }
+            Ok(_) => tracing::warn!("doubt is not stated: the frames have another number of phases than the field"),
+            Err(error) => tracing::warn!("doubt is not stated: {error}"),
+        }
     }
 
     /// Cancels the long work that is under way in other threads: scores, trees, volumes and exact pictures. It ends with

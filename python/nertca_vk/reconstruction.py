@@ -582,7 +582,13 @@ class Reconstruction:
             }
             points_mm = np.empty((struct.points, 3))
             radius_mm = np.empty(struct.points)
-            arrays: dict[str, npt.NDArray[Any]] = {**of_branches, "points_mm": points_mm, "radius_mm": radius_mm}
+            of_doubt = {name: np.empty(struct.points) for name in ("doubt_mm", "doubt_with_motion_mm", "existence")}
+            arrays: dict[str, npt.NDArray[Any]] = {
+                **of_branches,
+                "points_mm": points_mm,
+                "radius_mm": radius_mm,
+                **of_doubt,
+            }
             kept = {name: writable(array) for name, array in arrays.items()}
             for name, memory in kept.items():
                 setattr(struct, name, ffi.cast(ffi.typeof(getattr(struct, name)), memory))
@@ -594,6 +600,7 @@ class Reconstruction:
                 parent=int(parent) if parent >= 0 else None,
                 points_mm=points_mm[first : first + count],
                 radius_mm=radius_mm[first : first + count],
+                **{name: values[first : first + count] for name, values in of_doubt.items()},
             )
             for phase, parent, first, count in zip(*of_branches.values())
         ]

@@ -165,6 +165,14 @@ class Branch:
     """Points (LPS), mm, of shape (points, 3); the first is the last of its parent."""
     radius_mm: npt.NDArray[np.float64]
     """Radius of the vessel at each point, mm, of shape (points,)."""
+    doubt_mm: Optional[npt.NDArray[np.float64]] = None
+    """Half width of the interval that contains the true centreline with a probability of 68 %, along the least certain direction across the
+    vessel, for each point, mm; NaN where there are no frames to compare with, as after a checkpoint was loaded. None for a branch of a
+    user's own."""
+    doubt_with_motion_mm: Optional[npt.NDArray[np.float64]] = None
+    """Half width for the material point, mm, which also holds its motion along the vessel; NaN where points are not followed."""
+    existence: Optional[npt.NDArray[np.float64]] = None
+    """Probability that a true vessel is within 3 mm of each point, 0 to 1."""
 
 
 @dataclass(frozen=True)

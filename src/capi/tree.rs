@@ -67,6 +67,15 @@ pub unsafe extern "C" fn nertca_reconstruction_tree(
             copy(&flat.points_mm, asked.points_mm);
             copy(&flat.radius_mm, asked.radius_mm);
         }
+        let of_doubt = [
+            (&flat.doubt_mm, asked.doubt_mm),
+            (&flat.doubt_with_motion_mm, asked.doubt_with_motion_mm),
+            (&flat.existence, asked.existence),
+        ];
+        for (values, array) in of_doubt.into_iter().filter(|(_, array)| !array.is_null()) {
+            // SAFETY: the array is not null, and the header requires as many elements as were compared above.
+            unsafe { copy(values, array) };
+        }
         Ok(())
     })
 }
@@ -141,7 +150,8 @@ fn wants_copies(asked: &nertca_tree) -> Outcome<bool> {
         ("points_mm", asked.points_mm.is_null()),
         ("radius_mm", asked.radius_mm.is_null()),
     ];
-    if missing.iter().all(|(_, null)| *null) {
+    let doubt = [asked.doubt_mm, asked.doubt_with_motion_mm, asked.existence];
+    if missing.iter().all(|(_, null)| *null) && doubt.iter().all(|array| array.is_null()) {
         return Ok(false);
     }
     match missing.iter().find(|(_, null)| *null) {
@@ -173,6 +183,9 @@ struct FlatTree {
     branch_points: Vec<u32>,
     points_mm: Vec<f64>,
     radius_mm: Vec<f64>,
+    doubt_mm: Vec<f64>,
+    doubt_with_motion_mm: Vec<f64>,
+    existence: Vec<f64>,
 }
 
 impl FlatTree {
@@ -180,13 +193,19 @@ impl FlatTree {
         let mut flat = FlatTree::default();
         for tree in &found.phases {
             let first = flat.branch_phase.len();
-            for Branch { parent, points_mm, radius_mm, .. } in &tree.branches {
+            for branch @ Branch { parent, points_mm, radius_mm, .. } in &tree.branches {
                 flat.branch_phase.push(tree.phase);
                 flat.branch_parent.push(parent.map_or(-1, |parent| (first + parent) as i32));
                 flat.branch_first.push(flat.radius_mm.len() as u32);
                 flat.branch_points.push(points_mm.len() as u32);
                 flat.points_mm.extend(points_mm.iter().flat_map(|point| point.to_array()));
                 flat.radius_mm.extend(radius_mm);
+                for point in 0..points_mm.len() {
+                    let doubt = branch.doubt.get(point);
+                    flat.doubt_mm.push(doubt.map_or(f64::NAN, |doubt| doubt.across_mm));
+                    flat.doubt_with_motion_mm.push(doubt.and_then(|doubt| doubt.with_motion_mm).unwrap_or(f64::NAN));
+                    flat.existence.push(doubt.map_or(f64::NAN, |doubt| doubt.existence));
+                }
             }
         }
         flat

@@ -365,6 +365,15 @@ pub struct nertca_tree {
     pub points_mm: *mut f64,
     /// Radius of the vessel at each point, mm.
     pub radius_mm: *mut f64,
+    /// Half width of the interval that contains the true centreline with a probability of 68 %, along the least certain direction across the
+    /// vessel, for each point, mm. This array and the next two may be null, and have room for `points` elements otherwise. They hold NaN where
+    /// the reconstruction has no frames to compare with, as after a checkpoint was loaded.
+    pub doubt_mm: *mut f64,
+    /// Half width for the material point, mm, which also holds its motion along the vessel, which no view tells; NaN where points are not
+    /// followed.
+    pub doubt_with_motion_mm: *mut f64,
+    /// Probability that a true vessel is within 3 mm of each point, 0 to 1.
+    pub existence: *mut f64,
 }
 
 /// A stenosis of the vessels that were found: a place where a vessel is narrower than its course elsewhere lets expect.
@@ -485,13 +494,19 @@ macro_rules! versioned {
         }
     )* };
 }
-versioned!(nertca_log nertca_geometry nertca_frame nertca_image nertca_grid nertca_progress nertca_correction nertca_tree
+versioned!(nertca_log nertca_geometry nertca_frame nertca_image nertca_grid nertca_progress nertca_correction
        nertca_lesion nertca_frame_status nertca_drawn);
 
 // SAFETY: integers, floats and pointers after a `usize`.
 unsafe impl Versioned for nertca_view {
     const NAME: &'static str = "nertca_view";
     const FIRST: usize = std::mem::offset_of!(nertca_view, after_phase);
+}
+
+// SAFETY: integers, floats and pointers after a `usize`.
+unsafe impl Versioned for nertca_tree {
+    const NAME: &'static str = "nertca_tree";
+    const FIRST: usize = std::mem::offset_of!(nertca_tree, doubt_mm);
 }
 
 // SAFETY: integers, pointers and optional function pointers after a `usize`.

@@ -10,7 +10,7 @@ use crate::score::calibrated::{TrueFrames, shift_of, true_rays};
 use crate::score::dice::mean;
 use crate::score::nearest::{LinePlace, Lines};
 use crate::score::shapes::WITHIN_MM;
-use crate::trees::tree::{BeatTree, PhaseTree};
+use crate::trees::tree::{BeatTree, EXISTS_WITHIN_MM, PhaseTree};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -46,6 +46,11 @@ pub struct TreeAgreement {
     pub reprojection_training_mm: Option<f64>,
     /// Mean distance of the centrelines in images of views that were not trained on, mm at the isocentre.
     pub reprojection_unseen_mm: Option<f64>,
+    /// Share of the reconstructed centreline whose true place is within the interval of its doubt, 0 to 1; `None` where doubt is not
+    /// stated.
+    pub within_doubt: Option<f64>,
+    /// Share of the reconstructed centreline that exists by the rule of [`EXISTS_WITHIN_MM`], minus the mean probability stated.
+    pub existence_error: Option<f64>,
     /// Mean error of the displacement of the reconstructed points since the reference phase, against the nearest true
     /// points, mm; only where points are followed, and not for the reference phase itself.
     pub motion_error_mm: Option<f64>,
@@ -129,6 +134,8 @@ fn means(phases: &[PhaseTreeScores]) -> TreeAgreement {
         components: all(|s| s.components),
         reprojection_training_mm: some(|s| s.reprojection_training_mm),
         reprojection_unseen_mm: some(|s| s.reprojection_unseen_mm),
+        within_doubt: some(|s| s.within_doubt),
+        existence_error: some(|s| s.existence_error),
         motion_error_mm: some(|s| s.motion_error_mm),
     }
 }
@@ -195,9 +202,16 @@ fn agreement(tree: &PhaseTree, truth: &[TrueLine]) -> TreeAgreement {
         found.add(length, is_near(near_ours.nearest(at.on(true_lines[at.line], DVec3::lerp)).0));
     }
     let mix = |a: f64, b: f64, share: f64| a + share * (b - a);
-    let [mut to_true, mut near, mut error, mut squared] = [(); 4].map(|()| Along::default());
+    let [mut to_true, mut near, mut error, mut squared, mut within, mut exists] = [(); 6].map(|()| Along::default());
     for (at, length) in finely(&our_lines) {
-        let (away, there) = near_truth.nearest(at.on(our_lines[at.line], DVec3::lerp));
+        let point = at.on(our_lines[at.line], DVec3::lerp);
+        let (away, there) = near_truth.nearest(point);
+        let doubt = tree.branches[at.line].doubt.get(at.from + usize::from(at.share > 0.5));
+        if let Some((doubt, there)) = doubt.zip(there) {
+            let off_mm = (there.on(true_lines[there.line], DVec3::lerp) - point).dot(doubt.direction).abs();
+            within.add(length, f64::from(u8::from(off_mm <= doubt.across_mm)));
+            exists.add(length, f64::from(u8::from(away <= EXISTS_WITHIN_MM)) - doubt.existence);
+        }
         to_true.add(length, away);
         near.add(length, is_near(away));
         if let Some(there) = there.filter(|_| away <= WITHIN_MM) {
@@ -216,6 +230,8 @@ fn agreement(tree: &PhaseTree, truth: &[TrueLine]) -> TreeAgreement {
         components: tree.components() as f64,
         reprojection_training_mm: None,
         reprojection_unseen_mm: None,
+        within_doubt: within.mean(),
+        existence_error: exists.mean(),
         motion_error_mm: None,
     }
 }
@@ -309,8 +325,13 @@ mod tests {
 
     fn beat(reference_phase: Option<u32>) -> BeatTree {
         let line = |phase: u32| (0..3).map(|i| DVec3::new(f64::from(i), f64::from(phase * phase), 0.0)).collect();
-        let branch =
-            |phase| Branch { parent: None, points_mm: line(phase), radius_mm: vec![1.0; 3], agreement: Vec::new() };
+        let branch = |phase| Branch {
+            parent: None,
+            points_mm: line(phase),
+            radius_mm: vec![1.0; 3],
+            agreement: Vec::new(),
+            doubt: Vec::new(),
+        };
         let phases = (0..4).map(|phase| PhaseTree { phase, branches: vec![branch(phase)] }).collect();
         BeatTree {
             reference_phase,

@@ -217,7 +217,7 @@ impl Finder<'_> {
         let branch = |Line { parent, points_mm }: Line| {
             let radius_mm = lumen.radii_mm(&points_mm);
             let agreement = self.agreement(&points_mm, phase);
-            Branch { parent, points_mm, radius_mm, agreement }
+            Branch { parent, points_mm, radius_mm, agreement, doubt: Vec::new() }
         };
         lines.into_iter().map(branch).collect()
     }

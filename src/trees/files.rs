@@ -6,7 +6,7 @@ use crate::formats::swc;
 use crate::formats::vtp::{self, Values};
 use crate::trees::lesions::{Lesion, lesions};
 use crate::trees::sight::TreeInView;
-use crate::trees::tree::{BeatTree, Branch, PhaseTree, TreeView};
+use crate::trees::tree::{BeatTree, Branch, Doubt, PhaseTree, TreeView};
 use crate::trees::tubes::to_glb;
 use glam::DVec3;
 use serde::Serialize;
@@ -123,6 +123,31 @@ struct BranchRow {
     radius_mm: Vec<f64>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     agreement: Vec<f64>,
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    doubt: Option<DoubtRows>,
+}
+
+/// Doubt about the points of a branch.
+#[derive(Serialize)]
+struct DoubtRows {
+    doubt_mm: Vec<f64>,
+    doubt_direction: Vec<[f64; 3]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    doubt_with_motion_mm: Option<Vec<f64>>,
+    existence: Vec<f64>,
+}
+
+impl DoubtRows {
+    /// Returns the rows of a branch; `None` where doubt is not stated.
+    fn of(branch: &Branch) -> Option<DoubtRows> {
+        let doubts = || branch.doubt.iter();
+        (!branch.doubt.is_empty()).then(|| DoubtRows {
+            doubt_mm: doubts().map(|doubt| rounded(doubt.across_mm)).collect(),
+            doubt_direction: doubts().map(|doubt| rounded_point(&doubt.direction)).collect(),
+            doubt_with_motion_mm: doubts().map(|doubt| doubt.with_motion_mm.map(rounded)).collect(),
+            existence: doubts().map(|doubt| rounded(doubt.existence)).collect(),
+        })
+    }
 }
 
 fn rounded(mm: f64) -> f64 {
@@ -141,6 +166,7 @@ impl BranchRow {
             points_mm: branch.points_mm.iter().map(rounded_point).collect(),
             radius_mm: branch.radius_mm.iter().copied().map(rounded).collect(),
             agreement: branch.agreement.iter().copied().map(rounded).collect(),
+            doubt: DoubtRows::of(branch),
         }
     }
 }
@@ -264,6 +290,14 @@ fn to_vtp(beat: &BeatTree, tree: &PhaseTree) -> String {
         let agreement = branches().flat_map(|b| b.agreement.iter().copied().map(rounded)).collect();
         of_points.push(Values::Float("Agreement", agreement));
     }
+    if branches().all(|b| b.doubt.len() == b.points_mm.len()) {
+        let doubts = |pick: fn(&Doubt) -> f64| branches().flat_map(|b| &b.doubt).map(pick).map(rounded).collect();
+        of_points.push(Values::Float("Doubt", doubts(|doubt| doubt.across_mm)));
+        of_points.push(Values::Float("Existence", doubts(|doubt| doubt.existence)));
+        let with_motion: Option<Vec<f64>> =
+            branches().flat_map(|b| &b.doubt).map(|doubt| doubt.with_motion_mm.map(rounded)).collect();
+        of_points.extend(with_motion.map(|widths| Values::Float("DoubtWithMotion", widths)));
+    }
     let lines = vtp::Lines {
         title: title(beat, tree),
         time: f64::from(tree.phase),
@@ -309,14 +343,27 @@ mod tests {
     fn beat(reference_phase: Option<u32>) -> BeatTree {
         let line = |points: &[f64]| points.iter().map(|x| DVec3::new(*x, 0.0, 1.0)).collect();
         let branches = vec![
-            Branch { parent: None, points_mm: line(&[0.0, 1.0]), radius_mm: vec![2.0, 1.5], agreement: Vec::new() },
+            Branch {
+                parent: None,
+                points_mm: line(&[0.0, 1.0]),
+                radius_mm: vec![2.0, 1.5],
+                agreement: Vec::new(),
+                doubt: Vec::new(),
+            },
             Branch {
                 parent: Some(0),
                 points_mm: line(&[1.0, 2.0, 3.0]),
                 radius_mm: vec![1.5, 1.0, 0.5],
                 agreement: Vec::new(),
+                doubt: Vec::new(),
             },
-            Branch { parent: Some(0), points_mm: line(&[1.0, 5.0]), radius_mm: vec![1.5, 0.7], agreement: Vec::new() },
+            Branch {
+                parent: Some(0),
+                points_mm: line(&[1.0, 5.0]),
+                radius_mm: vec![1.5, 0.7],
+                agreement: Vec::new(),
+                doubt: Vec::new(),
+            },
         ];
         let phases = vec![PhaseTree { phase: 3, branches }];
         BeatTree {

@@ -278,6 +278,7 @@ mod tests {
             points_mm: (0..n).map(|i| from + along * at(i)).collect(),
             radius_mm: (0..n).map(|i| radius(at(i))).collect(),
             agreement: Vec::new(),
+            doubt: Vec::new(),
         }
     }
 

@@ -216,6 +216,7 @@ mod tests {
             points_mm: (0..21).map(|i| from.lerp(to, f64::from(i) / 20.0)).collect(),
             radius_mm: vec![1.5; 21],
             agreement: vec![agreement; 21],
+            doubt: Vec::new(),
         }
     }
 

@@ -147,6 +147,7 @@ mod tests {
             points_mm: (0..41).map(|i| from.lerp(to, f64::from(i) / 40.0)).collect(),
             radius_mm: vec![1.0; 41],
             agreement: Vec::new(),
+            doubt: Vec::new(),
         }
     }
 

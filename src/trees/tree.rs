@@ -1,12 +1,32 @@
 //! Vessels as a tree of centrelines with radii, at one phase or followed over the beat; patient coordinates, LPS mm.
 
 use crate::geometry::ViewRays;
+use crate::raster::percentile;
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
 
 /// Share of the other fits below which a place is doubtful. With two views, 50 to 90 % of the places that nearly all fits have are true,
 /// and 10 to 50 % of those that fewer than this share have (`docs/performance.md`).
 pub const DOUBTFUL: f64 = 0.75;
+
+/// Probability that the interval of a [`Doubt`] contains the true place.
+pub const CONFIDENCE: f64 = 0.68;
+/// Distance within which a true vessel must lie for a point to exist, mm.
+pub const EXISTS_WITHIN_MM: f64 = 3.0;
+
+/// Doubt about a point of a centreline.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Doubt {
+    /// Half width, mm, of the interval that contains the true centreline with a probability of [`CONFIDENCE`], along `direction`.
+    pub across_mm: f64,
+    /// Least certain direction across the vessel, a unit vector (LPS).
+    pub direction: DVec3,
+    /// Half width, mm, for the material point, along its least certain direction: also along the vessel, where no view tells motion.
+    /// `None` where points are not followed, or where the reference phase is not among the phases of the tree.
+    pub with_motion_mm: Option<f64>,
+    /// Probability that a true vessel is within [`EXISTS_WITHIN_MM`], 0 to 1.
+    pub existence: f64,
+}
 
 /// A vessel between two bifurcations, or between a bifurcation and an end.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,6 +40,8 @@ pub struct Branch {
     /// Share of the other fits that have a vessel at each point, 0 to 1, where the field is the mean of several fits: points with little
     /// agreement may be false crossings. Empty for a single fit.
     pub agreement: Vec<f64>,
+    /// Doubt about each point ([`crate::trees::doubt`]); empty where the training images are not known.
+    pub doubt: Vec<Doubt>,
 }
 
 impl Branch {
@@ -43,6 +65,18 @@ impl Branch {
     pub fn mean_agreement(&self) -> Option<f64> {
         let n = self.agreement.len();
         (n > 0).then(|| self.agreement.iter().sum::<f64>() / n as f64)
+    }
+
+    /// Probability that the branch exists: the mean over its points, 0 to 1; `None` where doubt is not stated.
+    pub fn existence(&self) -> Option<f64> {
+        let n = self.doubt.len();
+        (n > 0).then(|| self.doubt.iter().map(|doubt| doubt.existence).sum::<f64>() / n as f64)
+    }
+
+    /// Median half width of the intervals of its points, mm; `None` where doubt is not stated.
+    pub fn median_doubt_mm(&self) -> Option<f64> {
+        let widths: Vec<f32> = self.doubt.iter().map(|doubt| doubt.across_mm as f32).collect();
+        (!widths.is_empty()).then(|| f64::from(percentile(&widths, 0.5)))
     }
 
     /// Minimum diameter of the lumen, mm.
@@ -140,6 +174,7 @@ mod tests {
             points_mm: (0..4).map(|i| DVec3::X * 2.0 * f64::from(i)).collect(),
             radius_mm: vec![1.0; 4],
             agreement: agreement.to_vec(),
+            doubt: Vec::new(),
         };
         let tree = |branches: Vec<Branch>| PhaseTree { phase: 0, branches };
         let doubt = tree(vec![line(&[1.0, 1.0, 0.4, 0.0]), line(&[1.0; 4])]);

@@ -140,6 +140,7 @@ mod tests {
             points_mm: (0..=40).map(point).collect(),
             radius_mm: (0..=40).map(|i| 2.0 - 0.02 * f64::from(i)).collect(),
             agreement: Vec::new(),
+            doubt: Vec::new(),
         }
     }
 

@@ -337,6 +337,8 @@ fn tree(b: &Bench) {
     let mut radius_mm = 0.0;
     let partly = nertca_tree { size, radius_mm: &mut radius_mm, ..zeroed() };
     b.refuses(tree, NERTCA_ERROR_ARGUMENT, "branch_phase", ask(b.trained, partly));
+    let only_doubt = nertca_tree { size, existence: &mut radius_mm, ..zeroed() };
+    b.refuses(tree, NERTCA_ERROR_ARGUMENT, "branch_phase", ask(b.trained, only_doubt));
     for bad in [-1.0, f64::NAN, f64::INFINITY] {
         let asked = nertca_tree { size, threshold_per_mm: bad, ..zeroed() };
         b.refuses(tree, NERTCA_ERROR_ARGUMENT, "threshold_per_mm", ask(b.trained, asked));

@@ -70,6 +70,35 @@ fn fields_that_carry_no_points_are_not_tracked() {
 }
 
 #[test]
+fn doubt_holds_what_it_says() {
+    let (directory, Trained { run, .. }) = (tempfile::tempdir().unwrap(), trained());
+    let tree = tree_of(run, &directory.path().join("all.json"), &[]);
+    let rest = &tree["phases"][tree["reference_phase"].as_u64().unwrap() as usize]["branches"];
+    for branch in rest.as_array().unwrap() {
+        let numbers = |field: &str| serde_json::from_value::<Vec<f64>>(branch[field].clone()).unwrap();
+        let points = numbers("radius_mm").len();
+        let (doubt_mm, with_motion_mm, existence) =
+            (numbers("doubt_mm"), numbers("doubt_with_motion_mm"), numbers("existence"));
+        assert_eq!([doubt_mm.len(), with_motion_mm.len(), existence.len()], [points; 3]);
+        assert_eq!(doubt_mm, with_motion_mm, "at the reference phase, points have not moved");
+        assert!(doubt_mm.iter().all(|mm| (0.01..2.0).contains(mm)), "{doubt_mm:?}");
+        assert!(existence.iter().all(|share| (0.5..1.0).contains(share)), "{existence:?}");
+        let directions: Vec<[f64; 3]> = serde_json::from_value(branch["doubt_direction"].clone()).unwrap();
+        assert!(directions.iter().all(|d| (d.iter().map(|v| v * v).sum::<f64>() - 1.0).abs() < 1e-3));
+    }
+    let (_, said) = ok(&["tree", text(run), "-o", text(&directory.path().join("one.vtp")), "--phase", "1"]);
+    assert!(said.contains("known to"), "{said}");
+    let vtp = std::fs::read_to_string(directory.path().join("one.vtp")).unwrap();
+    assert!(vtp.contains("\"Doubt\"") && vtp.contains("\"Existence\""));
+    // Without the data, the tree comes without doubt, and the program says so.
+    let lonely = directory.path().join("lonely");
+    std::fs::create_dir(&lonely).unwrap();
+    std::fs::copy(checkpoint::newest(run).unwrap(), lonely.join("checkpoint-0000060.safetensors")).unwrap();
+    let (_, said) = ok(&["tree", text(&lonely), "-o", text(&directory.path().join("lonely.json"))]);
+    assert!(said.contains("doubt") && said.contains("not stated"), "{said}");
+}
+
+#[test]
 fn options_change_what_is_found() {
     let (directory, Trained { run, .. }) = (tempfile::tempdir().unwrap(), trained());
     let file = |name: &str| directory.path().join(name);
@@ -182,6 +211,8 @@ fn c_callers_get_the_same_tree() {
     room.branch_points = count.as_mut_ptr();
     room.points_mm = points_mm.as_mut_ptr();
     room.radius_mm = radius_mm.as_mut_ptr();
+    let mut doubt_mm = vec![0.0; points];
+    room.doubt_mm = doubt_mm.as_mut_ptr();
     // Insufficient room is refused, and nothing is written.
     room.points -= 1;
     assert_eq!(unsafe { nertca_reconstruction_tree(reconstruction, &mut room) }, NERTCA_ERROR_BUFFER);
@@ -210,6 +241,7 @@ fn c_callers_get_the_same_tree() {
         }
     }
     assert_eq!(branch, n);
+    assert!(doubt_mm.iter().all(|doubt| doubt.is_nan()), "a checkpoint has no frames to compare with");
     assert_eq!(unsafe { nertca_reconstruction_destroy(reconstruction) }, NERTCA_OK);
     assert_eq!(unsafe { nertca_context_destroy(context) }, NERTCA_OK);
 }

@@ -11,7 +11,7 @@ import sys
 import numpy as np
 from PIL import Image
 from browser import Page
-from tree_numbers import measure, numbers_of
+from tree_numbers import doubt_of, measure, numbers_of
 
 NEAR_PX = 0.05
 
@@ -68,6 +68,8 @@ with Page("file://" + expected["page"]) as page:
         # Where a vessel runs along the view, a pixel is more of its length.
         assert np.allclose(numbers_of(told), wanted, atol=1.0), (told, wanted)
         assert np.allclose(numbers_of(told)[:3], wanted[:3], atol=0.06), (told, wanted)
+        doubt = tree[phase]["branches"][branch]
+        assert np.allclose(doubt_of(told), [doubt["doubt_mm"][i], 100 * doubt["existence"][i]], atol=0.6), told
         chosen = page.evaluate("[...document.querySelectorAll('tr.chosen')].map(r => +r.dataset.branch)")
         assert chosen and set(chosen) == {branch}, (chosen, branch)
     page.picture(sys.argv[2])
@@ -75,8 +77,11 @@ with Page("file://" + expected["page"]) as page:
     rows = page.evaluate("[...document.querySelectorAll('tr[data-branch]')].map(r => [+r.dataset.phase, +r.dataset.branch,"
                          " ...[...r.cells].slice(2).map(c => +c.textContent)])")
     assert {row[0] for row in rows} == {0, round(0.35 * len(tree))} and len(rows) == 2 * len(tree[0]["branches"])
-    for phase, branch, length, mean, least in rows:
+    for phase, branch, length, mean, least, known, exists in rows:
         wanted = measure(tree[int(phase)]["branches"][int(branch)], 0)
+        doubt = tree[int(phase)]["branches"][int(branch)]
+        assert min(doubt["doubt_mm"]) - 0.01 <= known <= max(doubt["doubt_mm"]) + 0.01, (phase, branch, known)
+        assert abs(exists - 100 * np.mean(doubt["existence"])) < 0.6, (phase, branch, exists)
         assert np.allclose([length, least, mean], wanted[:3], atol=0.051), (phase, branch, wanted)
 
     page.evaluate("document.getElementById('tree-lines').click()")

@@ -52,6 +52,39 @@ def motion_error(row):
     return errors[away <= NEAR_MM].mean()
 
 
+def within_doubt(row):
+    """Share of the points whose nearest true place is inside their interval."""
+    true = np.concatenate([finely(true_points[row["phase"]][b], true_radii[b])[:, :3] for b in true_branches])
+    inside = []
+    for branch in row["branches"]:
+        points, directions = np.array(branch["points_mm"]), np.array(branch["doubt_direction"])
+        off = ((true[cKDTree(true).query(points)[1]] - points) * directions).sum(axis=1)
+        inside += list(abs(off) <= branch["doubt_mm"])
+    return np.mean(inside)
+
+
+def check_directions(row):
+    """The least certain direction has the least information of all directions across the vessel, by the sources of the C-arms."""
+    sources = []
+    for f in frames:
+        if f["split"] == "train" and f["phase"] == row["phase"]:
+            a, b = np.radians([f["geometry"]["primary_deg"], f["geometry"]["secondary_deg"]])
+            beam = np.array([np.sin(a) * np.cos(b), -np.cos(a) * np.cos(b), np.sin(b)])
+            sources.append(-f["geometry"]["sod_mm"] * beam)
+    for branch in row["branches"]:
+        points = np.array(branch["points_mm"])
+        for i in range(3, len(points) - 3, 7):
+            along = points[i + 2] - points[i - 2]
+            along /= np.linalg.norm(along)
+            u = np.linalg.svd(along[None])[2][1:]
+            seen_across = [np.cross(points[i] - s, along) / np.linalg.norm(points[i] - s) for s in sources]
+            information = lambda d: sum((n @ d) ** 2 for n in seen_across)
+            angles = np.radians(np.arange(0, 180, 0.5))
+            least = min(information(np.cos(t) * u[0] + np.sin(t) * u[1]) for t in angles)
+            stated = np.array(branch["doubt_direction"][i])
+            assert abs(stated @ along) < 0.01 and information(stated) <= 1.01 * least + 1e-6, (i, stated, information(stated), least)
+
+
 def close(name, found, wanted, within):
     print(f"  {name}: {found:.4f}, SciPy {wanted:.4f}")
     assert abs(found - wanted) <= within, (name, found, wanted)
@@ -69,6 +102,9 @@ for row, found in zip(tree, scores["phases"]):
     close("components", found["components"], wanted["components"], 0)
     close("training images, mm", found["reprojection_training_mm"], reprojection(row, "train"), 0.01)
     close("unseen images, mm", found["reprojection_unseen_mm"], reprojection(row, "validation"), 0.01)
+    # Between points the program takes the nearer one's interval, the script only the points.
+    close("within doubt", found["within_doubt"], within_doubt(row), 0.08)
+    check_directions(row)
     if row is tree[0]:
         assert found["motion_error_mm"] is None, "nothing has moved since the phase that motion is counted from"
     else:

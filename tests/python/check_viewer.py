@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 from browser import Page
-from tree_numbers import measure, numbers_of
+from tree_numbers import doubt_of, measure, numbers_of
 
 NEAR_PX = 0.05
 
@@ -51,6 +51,8 @@ with Page(expected["url"]) as page:
         # Where a vessel runs along the view, a pixel is more of its length.
         assert np.allclose(numbers_of(told), wanted, atol=1.0), (told, wanted)
         assert np.allclose(numbers_of(told)[:3], wanted[:3], atol=0.06), (told, wanted)
+        doubt = tree[phase]["branches"][branch]
+        assert np.allclose(doubt_of(told), [doubt["doubt_mm"][i], 100 * doubt["existence"][i]], atol=0.6), told
         chosen = page.evaluate("[...document.querySelectorAll('#tree polyline')].findIndex(l => l.matches('.chosen'))")
         assert chosen == branch, (chosen, branch)
     page.picture(sys.argv[2])

@@ -11,4 +11,9 @@ def measure(branch, point):
 
 
 def numbers_of(told):
-    return [float(number) for number in re.findall(r"([0-9.]+) mm", told)]
+    return [float(number) for number in re.findall(r"([0-9.]+) mm", told)][:5]
+
+
+def doubt_of(told):
+    """The interval, mm, and the probability of existence, percent."""
+    return [float(number) for number in re.search(r"known to ([0-9.]+) mm \(68 %\), exists with ([0-9]+) %", told).groups()]

@@ -80,8 +80,11 @@ pub fn eval(global: &GlobalOptions, args: &EvalArgs) -> Result<()> {
     };
     let beside = page.parent().unwrap_or(Path::new(""));
     let warnings = &mut evaluation.warnings;
-    let found =
-        if args.tree { tree_of_page(global, (&gpu, &model), &dataset, &cancel, beside, warnings) } else { Ok(None) };
+    let found = if args.tree {
+        tree_of_page(global, (&gpu, &model), (run, &dataset), &cancel, beside, warnings)
+    } else {
+        Ok(None)
+    };
     // If the tree fails or is stopped, the scores are still printed.
     let tree = found.or_else(|error| print_scores(args, &evaluation).and(Err(error)))?;
     score_tree_of_page(tree.as_ref(), &dataset, &mut evaluation)?;

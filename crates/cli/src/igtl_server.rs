@@ -258,7 +258,7 @@ impl Beat {
         let (answer, first) = self.tree.ask();
         if let Some(first) = first {
             let (tree, source) = (self.tree.clone(), self.source.clone());
-            std::thread::spawn(move || tree.find(first, source.model()));
+            std::thread::spawn(move || tree.find(first, source.model(), |beat| source.compare_with_images(beat)));
         }
         let Ok(Answer { state, tree }) = serde_json::from_str(&answer) else { return };
         if state == "failed" {

@@ -34,8 +34,10 @@
       const frame = shown(view);
       image.setAttribute("href", frame.picture);
       caption.textContent = `${view.title}, phase ${frame.phase}`;
-      if ($("tree-lines").checked) overlay.draw(trees.branchesAt(tree, frame.phase), frame.projection, placeAt(frame.phase));
+      const branches = trees.branchesAt(tree, frame.phase);
+      if ($("tree-lines").checked) overlay.draw(branches, frame.projection, placeAt(frame.phase));
       else overlay.clear();
+      overlay.drawDoubt($("tree-doubt")?.checked ? branches : [], frame.projection);
     }
     const phase = place ? shown(place.view).phase : 0;
     const here = placeAt(phase);
@@ -47,6 +49,6 @@
   }
   for (const mark of document.querySelectorAll("[data-colour]")) mark.style.background = trees.colour(Number(mark.dataset.colour));
   $("tree-phase").max = phases - 1;
-  for (const id of ["tree-phase", "tree-lines"]) $(id).addEventListener("input", draw);
+  for (const id of ["tree-phase", "tree-lines", "tree-doubt"]) $(id)?.addEventListener("input", draw);
   draw();
 })();

@@ -149,7 +149,7 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     }
     drop(show);
     let tree = if args.tree {
-        tree_of_page(global, (&gpu, &model), &dataset, &cancel, run, &mut warnings)?
+        tree_of_page(global, (&gpu, &model), (run, &dataset), &cancel, run, &mut warnings)?
     } else {
         remove_old_tree(run, &mut warnings);
         None

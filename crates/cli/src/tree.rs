@@ -5,20 +5,23 @@ use super::export::phases;
 use super::options::GlobalOptions;
 use super::output::Earlier;
 use clap::Args;
+use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::checkpoint::newest_model;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::model::Model;
+use nertca_vk::raster::percentile;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::run::info::RunInfo;
 use nertca_vk::run::score::as_trained;
 use nertca_vk::run::tree_score::score_tree;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::Evaluation;
+use nertca_vk::trees::doubt::state_doubt;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
 use nertca_vk::trees::lesions::{Lesion, lesions};
-use nertca_vk::trees::tree::{BeatTree, DOUBTFUL, TreeView};
+use nertca_vk::trees::tree::{BeatTree, CONFIDENCE, DOUBTFUL, TreeView};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -58,7 +61,7 @@ const TREE_FILE: &str = "tree.json";
 pub fn of_page(
     global: &GlobalOptions,
     (gpu, model): (&Gpu, &Model),
-    dataset: &Dataset,
+    (run, dataset): (&Path, &Dataset),
     cancel: &AtomicBool,
     directory: &Path,
     warnings: &mut Vec<String>,
@@ -67,7 +70,7 @@ pub fn of_page(
     let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };
     match find(global, gpu, model, cancel, &options) {
         Ok(mut beat) => {
-            beat.views = TreeView::of(dataset);
+            compare_with_views(&mut beat, dataset, run)?;
             leave(&beat, directory, warnings)?;
             Ok(Some(beat))
         }
@@ -152,13 +155,30 @@ pub fn found_in_phases(global: &GlobalOptions, gpu: &Gpu, model: &Model, phases:
     find(global, gpu, model, &AtomicBool::new(false), &options)
 }
 
+/// States in a tree what depends on the training views of its run: the views themselves and the doubt about each point.
+fn compare_with_views(beat: &mut BeatTree, dataset: &Dataset, run: &Path) -> Result<()> {
+    let calibration = Calibration::read(run)?;
+    beat.views = TreeView::of(dataset);
+    state_doubt(beat, dataset, calibration.map_or(0.0, |calibration| calibration.disagreement_px));
+    Ok(())
+}
+
+/// Returns the dataset of a run as it was calibrated.
+fn dataset_of(run: &Path) -> Result<Dataset> {
+    let directory = if run.is_dir() { run } else { run.parent().unwrap_or(Path::new("")) };
+    as_trained(Dataset::open(&RunInfo::read(run)?.dataset)?, directory)
+}
+
+/// States in a tree what depends on the training views of a run; says why where they are not known.
+pub fn compare_with_run(beat: &mut BeatTree, run: &Path) {
+    if let Err(error) = dataset_of(run).and_then(|dataset| compare_with_views(beat, &dataset, run)) {
+        eprintln!("doubt and the sight of stenoses in the training views are not stated: {error}");
+    }
+}
+
 /// Returns the training views of a run as it was calibrated; where they are not known, `lacking` says what that means.
 pub fn training_views(run: &Path, lacking: &str) -> Vec<TreeView> {
-    let directory = if run.is_dir() { run } else { run.parent().unwrap_or(Path::new("")) };
-    let views = RunInfo::read(run)
-        .and_then(|info| as_trained(Dataset::open(&info.dataset)?, directory))
-        .map(|dataset| TreeView::of(&dataset));
-    views.unwrap_or_else(|error| {
+    dataset_of(run).map(|dataset| TreeView::of(&dataset)).unwrap_or_else(|error| {
         eprintln!("{lacking}: {error}");
         Vec::new()
     })
@@ -176,11 +196,17 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     let options = TreeOptions { phases, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
     // Ctrl-C may end the program at once, because no partial result has been written here.
     let mut beat = find(global, &gpu, &model, &AtomicBool::new(false), &options)?;
-    beat.views = training_views(&args.run, "the sight of stenoses in the training views is not stated");
+    compare_with_run(&mut beat, &args.run);
     let made = write(&beat, &args.out, format, all)?;
     earlier.make_way(&made)?;
     made.iter().for_each(|path| out!("{}", path.display()));
     for tree in &beat.phases {
+        let widths_mm: Vec<f32> =
+            tree.branches.iter().flat_map(|branch| &branch.doubt).map(|doubt| doubt.across_mm as f32).collect();
+        let width = match widths_mm.is_empty() {
+            true => String::new(),
+            false => format!(", known to {:.2} mm (median, {:.0} %)", percentile(&widths_mm, 0.5), 100.0 * CONFIDENCE),
+        };
         let share = format!("{:.0} % of the other fits", 100.0 * DOUBTFUL);
         let doubt = match tree.doubtful_mm() {
             None => String::new(),
@@ -188,7 +214,7 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
             Some(mm) => format!("; less than {share} have {mm:.1} mm of it, which may be false"),
         };
         eprintln!(
-            "phase {}: {:.1} mm in {} branches, components: {}{doubt}",
+            "phase {}: {:.1} mm in {} branches, components: {}{width}{doubt}",
             tree.phase,
             tree.length_mm(),
             tree.branches.len(),

@@ -12,7 +12,7 @@ use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk::scan::gating::SYSTOLE_SHARE;
 use nertca_vk::score::pictures::Window;
 use nertca_vk::trees::files::{note, to_json};
-use nertca_vk::trees::tree::{BeatTree, DOUBTFUL, PhaseTree, TreeView};
+use nertca_vk::trees::tree::{BeatTree, CONFIDENCE, DOUBTFUL, EXISTS_WITHIN_MM, PhaseTree, TreeView};
 use serde_json::{Value, json};
 
 const SCRIPT: &str = include_str!("report_trees.js");
@@ -22,6 +22,7 @@ const STYLE: &str = "
 #tree-views svg{width:100%;display:block}#tree-views image{image-rendering:pixelated}
 #tree-views polyline{fill:none;stroke-width:2px;vector-effect:non-scaling-stroke;stroke-linejoin:round;cursor:pointer}
 #tree-views .chosen{stroke-width:5px}#tree-views .mark{fill:#fff;stroke:#000;vector-effect:non-scaling-stroke}
+#tree-views .interval{fill:none;stroke:#fff;stroke-opacity:.7;stroke-width:1px;pointer-events:none}
 tr.chosen td{font-weight:600}td i{display:inline-block;width:.8rem;height:.8rem;margin-right:.4rem}";
 
 /// Contents of the section about a tree.
@@ -71,6 +72,9 @@ impl TreeSection {
                 label for="tree-phase" { "Phase " span #tree-phase-text {} " " }
                 input #tree-phase type="range" min="0" value="0" step="1";
                 " " label { input #tree-lines type="checkbox" checked; " centrelines" }
+                @if self.beat.phases.iter().flat_map(|tree| &tree.branches).all(|branch| !branch.doubt.is_empty()) {
+                    " " label { input #tree-doubt type="checkbox"; " intervals" }
+                }
             }
             p #tree-told role="status" {}
             div.by-view #tree-views {}
@@ -119,12 +123,14 @@ fn view_data(dataset: &Dataset, view: usize, step: usize) -> Result<Value> {
 
 fn table(beat: &BeatTree, name: &str, tree: &PhaseTree) -> Markup {
     let is_mean = tree.doubtful_mm().is_some();
+    let has_doubt = tree.branches.iter().all(|branch| !branch.doubt.is_empty());
     html! {
         div {
             h3 { (name) " (phase " (tree.phase) ")" }
             table {
                 tr { th { "branch" } th { "parent" } th { "length, mm" } th { "mean diameter, mm" } th { "minimum, \
                                                                                                           mm" }
+                    @if has_doubt { th { "known to, mm" } th { "exists, %" } }
                     @if is_mean { th { "other fits, %" } } }
                 @for (index, branch) in tree.branches.iter().enumerate() {
                     tr data-branch=(index) data-phase=(tree.phase) {
@@ -133,10 +139,19 @@ fn table(beat: &BeatTree, name: &str, tree: &PhaseTree) -> Markup {
                         td { (format!("{:.1}", branch.length_mm())) }
                         td { (format!("{:.2}", branch.mean_diameter_mm())) }
                         td { (format!("{:.2}", branch.min_diameter_mm())) }
+                        @if has_doubt {
+                            td { (branch.median_doubt_mm().map_or("-".into(), |mm| format!("{mm:.2}"))) }
+                            td { (branch.existence().map_or("-".into(), |share| format!("{:.0}", 100.0 * share))) }
+                        }
                         @if is_mean { td { (branch.mean_agreement().map_or("-".into(), |share| format!("{:.0}", 100.0 * share))) } }
                     }
                 }
-                tr { td { "all" } td {} td { (format!("{:.1}", tree.length_mm())) } td {} td {} @if is_mean { td {} } }
+                tr { td { "all" } td {} td { (format!("{:.1}", tree.length_mm())) } td {} td {} @if has_doubt { td {} td {} } @if is_mean { td {} } }
+            }
+            @if has_doubt {
+                p { "\"Known to\" is the median, along the branch, of the half width of the interval that contains the true centreline with a "
+                    "probability of " (format!("{:.0}", 100.0 * CONFIDENCE)) " %, in its least certain direction. \"Exists\" is the mean "
+                    "probability that a true vessel is within " (EXISTS_WITHIN_MM) " mm." }
             }
             (lesion_section::section(beat, tree))
             @if let Some(mm) = tree.doubtful_mm().filter(|mm| *mm > 0.0) {

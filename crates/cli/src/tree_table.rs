@@ -3,7 +3,7 @@
 use super::score_table::{Column, ScoreTable, mm, percent};
 use nertca_vk::score::trees::{TreeAgreement, TreeScores};
 
-const COLUMNS: [Column<TreeAgreement>; 9] = [
+const COLUMNS: [Column<TreeAgreement>; 10] = [
     Column { heading: ["centreline", "found"], text: |s| percent(Some(s.true_centreline_found)) },
     Column { heading: ["centreline", "true"], text: |s| percent(Some(s.our_centreline_true)) },
     Column { heading: ["distance to", "true, mm"], text: |s| mm(Some(s.ours_to_true_mm)) },
@@ -12,6 +12,7 @@ const COLUMNS: [Column<TreeAgreement>; 9] = [
     Column { heading: ["", "components"], text: |s| format!("{:.1}", s.components) },
     Column { heading: ["in training", "images, mm"], text: |s| mm(s.reprojection_training_mm) },
     Column { heading: ["in unseen", "images, mm"], text: |s| mm(s.reprojection_unseen_mm) },
+    Column { heading: ["within", "68 % interval"], text: |s| percent(s.within_doubt) },
     Column { heading: ["motion", "error, mm"], text: |s| mm(s.motion_error_mm) },
 ];
 
@@ -20,7 +21,8 @@ pub fn table(tree: &TreeScores) -> ScoreTable {
     let legend = format!(
         "The extracted vessel tree is compared with the true one. Centrelines agree where their distance is at most {} \
          mm, and radii are compared there. In images, the score is the mean distance at the isocentre. The motion \
-         error compares the displacements of points since the reference phase (mostly 0).",
+         error compares the displacements of points since the reference phase (mostly 0). The interval is that of the \
+         doubt about each point.",
         tree.within_mm
     );
     let phases = tree.phases.iter().map(|p| (p.phase, &p.scores));

@@ -39,6 +39,7 @@ const trees = (() => {
     return tree.phases[before % n].branches.map((branch, b) => ({
       points_mm: branch.points_mm.map((p, i) => p.map((v, axis) => mix(v, next[b].points_mm[i][axis], share))),
       radius_mm: branch.radius_mm.map((r, i) => mix(r, next[b].radius_mm[i], share)),
+      doubt_mm: branch.doubt_mm, doubt_direction: branch.doubt_direction, existence: branch.existence,
     }));
   }
 
@@ -63,7 +64,15 @@ const trees = (() => {
   function told(branches, place) {
     const m = measure(branches[place.branch], place), mm = v => v.toFixed(2) + " mm";
     return `Branch ${place.branch}: ${m.length_mm.toFixed(1)} mm long; minimum diameter ${mm(m.least_mm)}, `
-      + `mean ${mm(m.mean_mm)}, ${mm(m.here_mm)} at this point, ${m.along_mm.toFixed(1)} mm from its start`;
+      + `mean ${mm(m.mean_mm)}, ${mm(m.here_mm)} at this point, ${m.along_mm.toFixed(1)} mm from its start`
+      + doubtTold(branches[place.branch], place);
+  }
+
+  // Returns the text about the doubt at a place; nothing where doubt is not stated.
+  function doubtTold({doubt_mm, existence}, {from, share}) {
+    if (!doubt_mm) return "";
+    const here = values => mix(values[from], values[from + 1], share);
+    return `; known to ${here(doubt_mm).toFixed(2)} mm (68 %), exists with ${(100 * here(existence)).toFixed(0)} %`;
   }
 
   // Draws lines over one picture, in an SVG element whose units are the picture's pixels.
@@ -72,6 +81,18 @@ const trees = (() => {
       this.svg = svg; this.lines = []; this.seen = []; this.branches = [];
       this.mark = svg.appendChild(document.createElementNS(SVG, "circle"));
       this.mark.setAttribute("class", "mark");
+      this.intervals = svg.insertBefore(document.createElementNS(SVG, "path"), this.mark);
+      this.intervals.setAttribute("class", "interval");
+      this.intervals.setAttribute("vector-effect", "non-scaling-stroke");
+    }
+    // Draws the intervals of all points, each as a line along its least certain direction; none without branches.
+    drawDoubt(branches, projection) {
+      const strokes = branches.filter(branch => branch.doubt_mm).flatMap(branch => branch.points_mm.map((point, i) => {
+        const end = sign => point.map((v, axis) => v + sign * branch.doubt_mm[i] * branch.doubt_direction[i][axis]);
+        const ends = [-1, 1].map(sign => project(projection, end(sign)));
+        return ends.every(Boolean) ? "M" + ends.map(p => p.map(v => v.toFixed(2)).join(" ")).join("L") : "";
+      }));
+      this.intervals.setAttribute("d", strokes.join(""));
     }
     clear() { this.draw([], null, null); }
     draw(branches, projection, place) {

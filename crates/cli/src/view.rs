@@ -1,6 +1,7 @@
 //! `view`: shows a run in a browser.
 
 use super::options::GlobalOptions;
+use super::tree::compare_with_run;
 use super::view_server::{AngiogramGeometry, PictureSource, Server, TYPICAL_SIDE};
 use super::view_tree::TreeWork;
 use clap::Args;
@@ -14,6 +15,7 @@ use nertca_vk::model::component::Component;
 use nertca_vk::render::baked::Baked;
 use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::render::renderer::Renderer;
+use nertca_vk::trees::tree::BeatTree;
 use serde_json::{Value, json};
 use std::collections::HashMap;
 use std::path::PathBuf;
@@ -34,6 +36,7 @@ const CELL_MM: f64 = 0.5;
 
 /// A run that does not change.
 struct Finished {
+    run: PathBuf,
     model: Model,
     taken: AngiogramGeometry,
     /// Baked volumes. The lock allows one picture at a time, because pictures share the device.
@@ -68,6 +71,10 @@ impl PictureSource for Finished {
     fn model(&self) -> Result<Model> {
         Ok(self.model.clone())
     }
+
+    fn compare_with_images(&self, beat: &mut BeatTree) {
+        compare_with_run(beat, &self.run);
+    }
 }
 
 /// Serves the page until Ctrl-C.
@@ -78,6 +85,7 @@ pub fn view(global: &GlobalOptions, args: &ViewArgs) -> Result<()> {
     let renderer = Arc::new(Renderer::new(&gpu, &model, tuning.clone())?);
     eprintln!("preparing {} phases on {} ...", model.shown_phases(), gpu.info().name);
     let mut shown = Finished {
+        run: args.run.clone(),
         taken: AngiogramGeometry { c_arm: model.c_arm.clone(), image_size: model.image_size },
         baked: Mutex::new(Baked::for_display(renderer, &model, CELL_MM)),
         gpu: gpu.clone(),

@@ -19,6 +19,7 @@ use nertca_vk::formats::png;
 use nertca_vk::geometry::{CArm, Geometry, ViewRays};
 use nertca_vk::model::Model;
 use nertca_vk::render::quantity::Quantity;
+use nertca_vk::trees::tree::BeatTree;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::net::{Ipv4Addr, SocketAddr};
@@ -108,6 +109,9 @@ pub trait PictureSource: Send + Sync {
     /// # Errors
     /// Fails like [`PictureSource::render`].
     fn model(&self) -> Result<Model>;
+
+    /// States in a tree what depends on the images of the training views, where they are known.
+    fn compare_with_images(&self, beat: &mut BeatTree);
 }
 
 struct Viewer {
@@ -231,7 +235,10 @@ fn json_answer(text: String) -> Response {
 async fn tree(State(viewer): State<Arc<Viewer>>) -> Response {
     let (answer, first) = viewer.tree.ask();
     if let Some(generation) = first {
-        tokio::task::spawn_blocking(move || viewer.tree.find(generation, viewer.shown.model()));
+        tokio::task::spawn_blocking(move || {
+            let shown = &viewer.shown;
+            viewer.tree.find(generation, shown.model(), |beat| shown.compare_with_images(beat));
+        });
     }
     json_answer(answer)
 }
@@ -417,6 +424,8 @@ mod tests {
         fn model(&self) -> Result<Model> {
             Err(Error::NotReady("there is no model".into()))
         }
+
+        fn compare_with_images(&self, _: &mut BeatTree) {}
     }
 
     #[test]

@@ -7,6 +7,7 @@ use nertca_vk::model::Model;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::to_json;
+use nertca_vk::trees::tree::BeatTree;
 use serde_json::json;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -71,9 +72,9 @@ impl TreeWork {
         (answer, first)
     }
 
-    /// Finds the tree of a model, if the model exists. Takes seconds.
-    pub fn find(&self, generation: u64, model: Result<Model>) {
-        let found = match model.and_then(|model| self.tree(generation, &model)) {
+    /// Finds the tree of a model, if the model exists, and completes it by `compare`, which knows the images. Takes seconds.
+    pub fn find(&self, generation: u64, model: Result<Model>, compare: impl FnOnce(&mut BeatTree)) {
+        let found = match model.and_then(|model| self.tree(generation, &model, compare)) {
             Ok(json) => TreeState::Ready(json),
             Err(error) => TreeState::Failed(error.to_string()),
         };
@@ -106,7 +107,7 @@ impl TreeWork {
         self.stop.store(true, Ordering::Relaxed);
     }
 
-    fn tree(&self, generation: u64, model: &Model) -> Result<String> {
+    fn tree(&self, generation: u64, model: &Model, compare: impl FnOnce(&mut BeatTree)) -> Result<String> {
         // The search has its own renderer, because the viewer's renderer goes on drawing pictures, which pass between the slices of
         // the search.
         let (looks, stop) = (self.gpu.looks().clone(), self.stop.clone());
@@ -117,10 +118,11 @@ impl TreeWork {
         let renderer = Renderer::new(&self.gpu, model, self.tuning.clone())?.in_slices(Arc::new(interlude));
         let phases = (0..model.shown_phases()).collect();
         let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };
-        let beat = vessel_trees(&renderer, model, &options, |done, of| {
+        let mut beat = vessel_trees(&renderer, model, &options, |done, of| {
             let wanted = self.tell(generation, TreeState::Working { done, of });
             if wanted && !self.stop.load(Ordering::Relaxed) { Ok(()) } else { Err(Error::Interrupted) }
         })?;
+        compare(&mut beat);
         to_json(&beat)
     }
 }

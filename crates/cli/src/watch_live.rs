@@ -6,6 +6,7 @@ use nertca_vk::geometry::ViewRays;
 use nertca_vk::model::Model;
 use nertca_vk::render::quantity::Quantity;
 use nertca_vk::session::{Session, State};
+use nertca_vk::trees::tree::BeatTree;
 use serde_json::{Value, json};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -101,5 +102,11 @@ impl PictureSource for Live {
 
     fn model(&self) -> Result<Model> {
         Ok(self.session()?.checkpoint()?.model)
+    }
+
+    fn compare_with_images(&self, beat: &mut BeatTree) {
+        if let Ok(session) = self.session() {
+            session.compare_with_images(beat);
+        }
     }
 }

@@ -178,6 +178,9 @@ def test_a_tree_is_its_own_truth(context: Context) -> None:
         made.add_frame(pixels(1, 1), geometry(1), phase=1, split="validation")
         threshold = float(np.quantile(made.volume(Grid.around_isocentre(20.0, 1.0)), 0.98))
         tree = made.tree(threshold_per_mm=threshold)
+        for branch in tree.branches:
+            assert branch.doubt_mm.shape == branch.existence.shape == branch.radius_mm.shape
+            assert (branch.doubt_mm > 0).all() and (0 < branch.existence).all() and (branch.existence < 1).all()
         at_rest = nertca_vk.Tree(tree.threshold_per_mm, False, tree.at(0))
         made.set_true_tree(at_rest)
         scores = made.evaluate(threshold)
@@ -228,6 +231,7 @@ def test_a_phantoms_vessels_become_a_tree(tmp_path: Path) -> None:
     (checkpoint,) = sorted(run.rglob("*.safetensors"))[-1:]
     with Context() as context, Reconstruction.from_checkpoint(checkpoint, context=context) as loaded:
         tree = loaded.tree()
+        assert np.isnan(tree.branches[0].doubt_mm).all(), "a checkpoint has no frames to compare with"
         program("tree", run, "--out", tmp_path / "beat.json")
         truth = json.loads((tmp_path / "beat.json").read_text())
         assert tree.followed == truth["tracked"] and tree.threshold_per_mm > 0

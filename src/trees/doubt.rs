@@ -1,0 +1,277 @@
+//! Doubt about vessels: how far a point of a centreline may be from the true one, and whether there is a vessel at all.
+//!
+//! A view shows where a vessel is across its image, but neither its depth nor its motion along itself. The least certain direction of a
+//! point follows from the directions of its rays. The scale of the error comes from the images (distance of the centreline from the ridges)
+//! and from the calibration (how far the stated views disagreed), because corrections remove a part of an error only. The constants were
+//! fitted to phantoms with known vessels (`docs/performance.md`).
+
+use crate::evidence::background::Background;
+use crate::evidence::series::Series;
+use crate::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
+use crate::raster::percentile;
+use crate::scan::dataset::Dataset;
+use crate::trees::refine::tangents;
+use crate::trees::ridges::ridge_offset;
+use crate::trees::sight::TreeInView;
+use crate::trees::tree::{BeatTree, CONFIDENCE, Doubt, PhaseTree};
+use glam::{DVec2, DVec3};
+
+/// Error of a view's image of a centreline, as a share of the distance to the ridges that [`CONFIDENCE`] of the points have: a point
+/// is the mean of several views, phases and neighbours.
+const OF_RIDGES: f64 = 0.45;
+/// Error where no image tells it, pixels.
+const WITHOUT_IMAGES_PX: f64 = 0.1;
+/// Exponent of the stated views' disagreement in the error that calibration leaves.
+const LEFT_EXPONENT: f64 = 0.5;
+/// Error that calibration leaves of a disagreement of 1 mm with three views, mm.
+const LEFT_OF_THREE_MM: f64 = 0.15;
+/// Maximum error that calibration leaves of a disagreement of 1 mm, mm: two views.
+const LEFT_MAX_MM: f64 = 0.5;
+/// Least information of a direction across a vessel, in units of a view that is perpendicular to it. Rays that nearly coincide tell no
+/// depth, and the smoothness of the vessel limits the error then.
+const MIN_INFORMATION: f64 = 0.01;
+/// Error of the motion along a vessel: its share of the displacement since the reference phase, and its maximum, mm.
+const ALONG_SHARE: f64 = 0.5;
+const ALONG_MAX_MM: f64 = 1.0;
+
+/// Half width, mm, of the interval of false crossings with two views, for the share of the other fits that have a vessel at the point.
+const FALSE_CROSSINGS_MM: [(f64, f64); 5] = [(0.2, 3.0), (0.49, 5.0), (0.71, 3.3), (0.9, 1.0), (1.0, 0.2)];
+/// Half width of that interval for a single fit of two views, mm.
+const SINGLE_FALSE_CROSSINGS_MM: f64 = 2.2;
+/// Probability that a point exists with two views, for the share of the other fits that have a vessel there.
+const EXISTENCE_OF_TWO: [(f64, f64); 4] = [(0.49, 0.36), (0.71, 0.51), (0.9, 0.69), (1.0, 0.9)];
+/// Probability that a point exists with more views.
+const EXISTENCE_OF_MORE: [(f64, f64); 5] = [(0.2, 0.77), (0.49, 0.85), (0.71, 0.88), (0.9, 0.978), (1.0, 0.999)];
+/// Probability that a point of a single fit exists: with two views, and with more.
+const EXISTENCE_SINGLE: [f64; 2] = [0.61, 0.997];
+
+/// States the doubt about all points of a tree. The dataset has the geometry that the reconstruction used; its stated views disagreed by
+/// so many pixels ([`crate::calibrate::correction::Calibration::disagreement_px`]).
+pub fn state_doubt(beat: &mut BeatTree, dataset: &Dataset, disagreement_px: f64) {
+    let views = dataset.training_views();
+    let Some(first) = views.first() else { return };
+    let pixel_mm = dataset.views[*first].rays.anchor[1].length() * MM_PER_UNIT;
+    let backgrounds: Vec<Background> = Series::each(dataset).map(Background::new).collect();
+    let shown: Vec<Vec<FrameView<'_>>> =
+        beat.phases.iter().map(|tree| frame_views(tree, dataset, &backgrounds, beat.resolution_mm)).collect();
+    let from_images_mm = pixel_mm * image_error_px(&beat.phases, &shown);
+    let left_mm = left_by_calibration_mm(views.len(), disagreement_px * pixel_mm);
+    let scale = Scale { image_mm: from_images_mm.hypot(left_mm), n_views: views.len() };
+    let reference = beat.phases.iter().find(|tree| Some(tree.phase) == beat.reference_phase).cloned();
+    for (tree, shown) in beat.phases.iter_mut().zip(&shown) {
+        for b in 0..tree.branches.len() {
+            let rest = reference.as_ref().map(|reference| &reference.branches[b].points_mm);
+            let doubt = |(i, tangent): (usize, DVec3)| {
+                let moved_mm = rest.map(|rest| rest[i].distance(tree.branches[b].points_mm[i]));
+                let agreement = tree.branches[b].agreement.get(i).copied();
+                let rays = shown.iter().filter(|view| view.shows(b, i)).map(|view| view.sight.ray(b, i));
+                scale.doubt(rays, tangent, moved_mm, agreement)
+            };
+            let doubts = tangents(&tree.branches[b].points_mm).into_iter().enumerate().map(doubt).collect();
+            tree.branches[b].doubt = doubts;
+        }
+    }
+}
+
+/// A tree as the training image of a view shows it.
+struct FrameView<'a> {
+    sight: TreeInView,
+    rays: ViewRays,
+    dataset: &'a Dataset,
+    view: usize,
+    /// Places of the points in the image, `[branch][point]`; `None` behind the source.
+    pixels: Vec<Vec<Option<DVec2>>>,
+    background: Option<&'a Background>,
+}
+
+impl FrameView<'_> {
+    /// Tells whether a point lies in a part of the image that is not hidden.
+    fn shows(&self, branch: usize, point: usize) -> bool {
+        let [width, height] = self.dataset.views[self.view].size;
+        self.pixels[branch][point].is_some_and(|pixel| {
+            let [x, y] = [pixel.x.round(), pixel.y.round()];
+            let inside = x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
+            inside && self.dataset.shows(self.view, y as usize * self.dataset.width + x as usize)
+        })
+    }
+
+    /// Returns the distance of a point from the ridge of the vessel in the image, pixels.
+    fn ridge_px(&self, tree: &PhaseTree, branch: usize, point: usize, tangent: DVec3) -> Option<f32> {
+        let background = self.background?;
+        if self.sight.is_covered(branch, point) || !self.shows(branch, point) {
+            return None;
+        }
+        let here = self.pixels[branch][point]?;
+        let ahead = projected(&self.rays, tree.branches[branch].points_mm[point] + tangent)?;
+        let across = (ahead - here).perp().try_normalize()?;
+        let change = background.changes[tree.phase as usize].as_ref()?;
+        ridge_offset(change, background.strongest, here, across).map(|offset| offset.abs() as f32)
+    }
+}
+
+fn projected(rays: &ViewRays, point_mm: DVec3) -> Option<DVec2> {
+    rays.project(world_from_lps_mm(point_mm)).map(|(column, row)| DVec2::new(column, row))
+}
+
+fn frame_views<'a>(
+    tree: &PhaseTree,
+    dataset: &'a Dataset,
+    backgrounds: &'a [Background],
+    resolution_mm: f64,
+) -> Vec<FrameView<'a>> {
+    let of_view = |view: usize| {
+        let rays = dataset.heart_rays_at(view, tree.phase);
+        let pixels = tree.branches.iter().map(|b| b.points_mm.iter().map(|p| projected(&rays, *p)).collect()).collect();
+        FrameView {
+            sight: TreeInView::new(tree, &rays, resolution_mm),
+            rays,
+            dataset,
+            view,
+            pixels,
+            background: backgrounds.iter().find(|background| background.stilled.view == view),
+        }
+    };
+    dataset.training_views().into_iter().map(of_view).collect()
+}
+
+/// Returns the error of the images of centrelines, pixels.
+fn image_error_px(phases: &[PhaseTree], shown: &[Vec<FrameView<'_>>]) -> f64 {
+    let mut distances = Vec::new();
+    for (tree, views) in phases.iter().zip(shown) {
+        for (b, branch) in tree.branches.iter().enumerate() {
+            for (i, tangent) in tangents(&branch.points_mm).into_iter().enumerate() {
+                distances.extend(views.iter().filter_map(|view| view.ridge_px(tree, b, i, tangent)));
+            }
+        }
+    }
+    match distances.is_empty() {
+        true => WITHOUT_IMAGES_PX,
+        false => OF_RIDGES * f64::from(percentile(&distances, CONFIDENCE)),
+    }
+}
+
+/// Returns the error that calibration leaves of a disagreement of the stated views, mm. Each further view constrains the others.
+fn left_by_calibration_mm(n_views: usize, disagreement_mm: f64) -> f64 {
+    let of_one_mm = LEFT_OF_THREE_MM * (2.0 / (n_views as f64 - 1.0).max(1.0)).powi(2);
+    of_one_mm.min(LEFT_MAX_MM) * disagreement_mm.powf(LEFT_EXPONENT)
+}
+
+/// Scale of the errors of a reconstruction.
+struct Scale {
+    /// Error of the images of centrelines, mm at the isocentre.
+    image_mm: f64,
+    /// Number of training views.
+    n_views: usize,
+}
+
+impl Scale {
+    /// Returns the doubt about a point, from the directions of the rays that show it, the direction of the vessel, the distance that the point
+    /// has moved since the reference phase, and the share of the other fits that have a vessel there.
+    fn doubt(
+        &self,
+        rays: impl Iterator<Item = DVec3>,
+        tangent: DVec3,
+        moved_mm: Option<f64>,
+        agreement: Option<f64>,
+    ) -> Doubt {
+        let (direction, dilution) = least_certain(rays, tangent);
+        let seen_mm = self.image_mm * dilution;
+        let across_mm = match (self.n_views, agreement) {
+            (..=2, None) => seen_mm.hypot(SINGLE_FALSE_CROSSINGS_MM),
+            (..=2, Some(share)) => seen_mm.hypot(between(&FALSE_CROSSINGS_MM, share)),
+            // Where few of the other fits have a vessel, errors were seen to be up to twice as large.
+            (_, Some(share)) => seen_mm * (2.0 - share),
+            (_, None) => seen_mm,
+        };
+        let existence = match (self.n_views, agreement) {
+            (..=2, None) => EXISTENCE_SINGLE[0],
+            (_, None) => EXISTENCE_SINGLE[1],
+            (..=2, Some(share)) => between(&EXISTENCE_OF_TWO, share),
+            (_, Some(share)) => between(&EXISTENCE_OF_MORE, share),
+        };
+        let with_motion_mm = moved_mm.map(|moved_mm| across_mm.max((ALONG_SHARE * moved_mm).min(ALONG_MAX_MM)));
+        Doubt { across_mm, direction, with_motion_mm, existence }
+    }
+}
+
+/// Returns the least certain direction across a vessel, and the error of a point along it in units of the error of one image: each ray
+/// informs about the direction that is perpendicular to itself and to the vessel.
+fn least_certain(rays: impl Iterator<Item = DVec3>, tangent: DVec3) -> (DVec3, f64) {
+    let (u, v) = tangent.any_orthonormal_pair();
+    let (mut uu, mut uv, mut vv) = (0.0, 0.0, 0.0);
+    for ray in rays {
+        let seen = ray.cross(tangent);
+        let (a, b) = (seen.dot(u), seen.dot(v));
+        (uu, uv, vv) = (uu + a * a, uv + a * b, vv + b * b);
+    }
+    let (mean, spread) = (0.5 * (uu + vv), (0.5 * (uu - vv)).hypot(uv));
+    let least = (mean - spread).max(MIN_INFORMATION);
+    // Angle of the largest information; the least one is perpendicular.
+    let most = 0.5 * (2.0 * uv).atan2(uu - vv);
+    (v * most.cos() - u * most.sin(), least.sqrt().recip())
+}
+
+/// Returns the value of a table (arguments in ascending order), interpolated linearly; beyond the ends, the value at the end.
+fn between(table: &[(f64, f64)], at: f64) -> f64 {
+    let after = table.iter().position(|(x, _)| *x >= at).unwrap_or(table.len() - 1);
+    let ((x0, y0), (x1, y1)) = (table[after.saturating_sub(1)], table[after]);
+    if x1 > x0 { y0 + (y1 - y0) * ((at - x0) / (x1 - x0)).clamp(0.0, 1.0) } else { y1 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn along(degrees: f64) -> DVec3 {
+        DVec3::new(degrees.to_radians().cos(), degrees.to_radians().sin(), 0.0)
+    }
+
+    #[test]
+    fn the_least_certain_direction_is_the_depth_of_rays_that_nearly_coincide() {
+        // Two rays 20 degrees apart about the x axis, and a vessel along z: each tells its perpendicular in the plane.
+        let (direction, dilution) = least_certain([along(-10.0), along(10.0)].into_iter(), DVec3::Z);
+        assert!(direction.dot(DVec3::X).abs() > 0.999, "{direction}");
+        let expected = (2.0 * 10f64.to_radians().sin().powi(2)).sqrt().recip();
+        assert!((dilution / expected - 1.0).abs() < 1e-9, "{dilution} instead of {expected}");
+        // Rays at right angles are equally good in all directions.
+        let (_, dilution) = least_certain([along(0.0), along(90.0)].into_iter(), DVec3::Z);
+        assert!((dilution - 1.0).abs() < 1e-9);
+        // A vessel along the plane of both rays: its place in the plane is not told.
+        let (direction, dilution) = least_certain([along(0.0), along(90.0)].into_iter(), DVec3::X);
+        assert!(direction.dot(DVec3::Y).abs() > 0.999 && dilution > 0.99, "{direction} {dilution}");
+        let (_, limited) = least_certain(std::iter::empty(), DVec3::Z);
+        assert!(
+            (limited - MIN_INFORMATION.sqrt().recip()).abs() < 1e-9,
+            "a point that no view shows has a finite interval"
+        );
+    }
+
+    #[test]
+    fn errors_of_images_and_calibration_add_up() {
+        let doubt = |n_views: usize, image_mm: f64, moved_mm: Option<f64>, agreement: Option<f64>| {
+            let rays = [along(0.0), along(90.0)].into_iter();
+            Scale { image_mm, n_views }.doubt(rays, DVec3::Z, moved_mm, agreement)
+        };
+        assert!((doubt(4, 0.2, None, None).across_mm - 0.2).abs() < 1e-9);
+        assert!((doubt(4, 0.2, None, Some(0.5)).across_mm - 0.3).abs() < 1e-9);
+        let across = doubt(4, 0.2, Some(0.2), None);
+        assert_eq!(across.with_motion_mm, Some(across.across_mm), "an error across the vessel is larger");
+        assert_eq!(doubt(4, 0.2, Some(1.0), None).with_motion_mm, Some(0.5));
+        assert_eq!(doubt(4, 0.2, Some(20.0), None).with_motion_mm, Some(ALONG_MAX_MM));
+        let of_two = [1.0, 0.7, 0.3].map(|share| doubt(2, 0.2, None, Some(share)));
+        assert!(of_two[0].across_mm < 0.3 && of_two[1].across_mm > 3.0, "{of_two:?}");
+        assert!(of_two[0].existence > of_two[1].existence && of_two[1].existence > of_two[2].existence);
+        // More views leave less of an error, and no disagreement leaves none.
+        let left = [2, 3, 4, 9].map(|n| left_by_calibration_mm(n, 2.0));
+        assert!(left.windows(2).all(|pair| pair[1] < 0.6 * pair[0]), "{left:?}");
+        assert_eq!(left_by_calibration_mm(3, 0.0), 0.0);
+    }
+
+    #[test]
+    fn tables_are_interpolated() {
+        let table = [(0.2, 3.0), (0.6, 5.0), (1.0, 1.0)];
+        for (at, value) in [(0.0, 3.0), (0.2, 3.0), (0.4, 4.0), (0.8, 3.0), (1.0, 1.0), (2.0, 1.0)] {
+            assert!((between(&table, at) - value).abs() < 1e-9, "{} at {at}", between(&table, at));
+        }
+    }
+}
