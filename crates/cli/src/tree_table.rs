@@ -12,7 +12,7 @@ const COLUMNS: [Column<TreeAgreement>; 10] = [
     Column { heading: ["", "components"], text: |s| format!("{:.1}", s.components) },
     Column { heading: ["in training", "images, mm"], text: |s| mm(s.reprojection_training_mm) },
     Column { heading: ["in unseen", "images, mm"], text: |s| mm(s.reprojection_unseen_mm) },
-    Column { heading: ["within", "68 % interval"], text: |s| percent(s.within_doubt) },
+    Column { heading: ["within", "doubt"], text: |s| percent(s.within_doubt) },
     Column { heading: ["motion", "error, mm"], text: |s| mm(s.motion_error_mm) },
 ];
 
@@ -21,8 +21,8 @@ pub fn table(tree: &TreeScores) -> ScoreTable {
     let legend = format!(
         "The extracted vessel tree is compared with the true one. Centrelines agree where their distance is at most {} \
          mm, and radii are compared there. In images, the score is the mean distance at the isocentre. The motion \
-         error compares the displacements of points since the reference phase (mostly 0). The interval is that of the \
-         doubt about each point.",
+         error compares the displacements of points since the reference phase (mostly 0). Within doubt \
+         is the share whose true place is inside the 68 % interval of the point.",
         tree.within_mm
     );
     let phases = tree.phases.iter().map(|p| (p.phase, &p.scores));
