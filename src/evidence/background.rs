@@ -101,7 +101,7 @@ impl Background {
         let mut changes = stilled.changes(&level, wide, None);
         let mut largest = largest_change(&changes, width, height);
         let mut strongest = percentile(&largest.values, STRONGEST_PERCENTILE);
-        let levels = Levels { low: &low, radius: narrow, largest: &largest, strongest, noise: &noise };
+        let levels = Levels { low: &low, radius: narrow, largest: &largest, strongest, noise: &noise, rounding: min };
         if let Some(Interiors { inside, background }) = interiors(&levels) {
             for pixel in (0..width * height).filter(|pixel| inside[*pixel]) {
                 level.values[pixel] = level.values[pixel].min(background.values[pixel]);

@@ -37,16 +37,18 @@ pub(super) struct Levels<'a> {
     pub(super) strongest: f32,
     /// Standard deviation of each pixel's noise.
     pub(super) noise: &'a [f32],
+    /// Bound of rounding errors, which images that do not change have instead of noise.
+    pub(super) rounding: f32,
 }
 
 /// Finds the interiors of the wide vessels; `None` where no vessel is wide.
 pub(super) fn interiors(levels: &Levels<'_>) -> Option<Interiors> {
-    let Levels { low, radius, largest, strongest, noise } = *levels;
+    let Levels { low, radius, largest, strongest, noise, rounding } = *levels;
     let size = [low.width, low.height];
     let background = opening(low, opening_radius(WIDEST_SHARE, low.width, low.height));
     let above = map2(low, &background, |low, background| low - background);
     let high: Vec<bool> = above.values.iter().map(|above| *above > MIN_HEIGHT * strongest).collect();
-    let least_change = |noise: &f32| (MIN_CHANGE * strongest).max(MIN_CHANGE_SIGMAS * noise);
+    let least_change = |noise: &f32| (MIN_CHANGE * strongest).max(MIN_CHANGE_SIGMAS * noise.max(rounding));
     let moves: Vec<bool> =
         largest.values.iter().zip(noise).map(|(change, noise)| *change > least_change(noise)).collect();
     // An edge lies where the opening of the level ends, or beside it.
@@ -59,7 +61,8 @@ pub(super) fn interiors(levels: &Levels<'_>) -> Option<Interiors> {
         let around = widened(&part, size, 1);
         let outline: Vec<usize> = (0..part.len()).filter(|pixel| around[*pixel] && !part[*pixel]).collect();
         let moving = outline.iter().filter(|pixel| edges[**pixel]).count() as f64;
-        if region.len() >= min_pixels && moving >= MIN_MOVING_OUTLINE * outline.len() as f64 {
+        let moves_around = !outline.is_empty() && moving >= MIN_MOVING_OUTLINE * outline.len() as f64;
+        if region.len() >= min_pixels && moves_around {
             let margin = widened(&part, size, radius);
             inside.iter_mut().zip(margin).for_each(|(inside, margin)| *inside |= margin);
         }
@@ -150,6 +153,14 @@ mod tests {
         let background = Background::new(series);
         assert!(background.strongest > 0.5, "the thin vessel moves");
         assert!((background.low.values[ROW + 25] - 2.0).abs() < 1e-5);
+    }
+
+    #[test]
+    fn without_motion_there_are_no_interiors() {
+        let background = view(14.0, 0.0);
+        for x in [25, 70] {
+            assert!((background.level.values[ROW + x] - 2.0).abs() < 1e-5, "the bar at column {x} is background");
+        }
     }
 
     #[test]
