@@ -743,7 +743,7 @@ typedef struct {
    */
   double *doubt_mm;
   /**
-   * Half width for the material point, mm, which also holds its motion along the vessel, which no view tells; NaN where points are not
+   * Half width for the material point, mm, which also holds its motion along the vessel, which no view shows; NaN where points are not
    * followed.
    */
   double *doubt_with_motion_mm;

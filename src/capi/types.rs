@@ -369,7 +369,7 @@ pub struct nertca_tree {
     /// vessel, for each point, mm. This array and the next two may be null, and have room for `points` elements otherwise. They hold NaN where
     /// the reconstruction has no frames to compare with, as after a checkpoint was loaded.
     pub doubt_mm: *mut f64,
-    /// Half width for the material point, mm, which also holds its motion along the vessel, which no view tells; NaN where points are not
+    /// Half width for the material point, mm, which also holds its motion along the vessel, which no view shows; NaN where points are not
     /// followed.
     pub doubt_with_motion_mm: *mut f64,
     /// Probability that a true vessel is within 3 mm of each point, 0 to 1.

@@ -1,5 +1,5 @@
 //! Interiors of wide vessels. A vessel that is wider than it moves covers its middle at every phase. No phase shows the background there,
-//! and an opening that removes usual vessels keeps it. The edges tell it from the background: they move on all sides of it.
+//! and an opening that removes usual vessels keeps it. Its edges distinguish it from the background: they move on all sides.
 
 use crate::evidence::filters::map2;
 use crate::evidence::series::opening_radius;
@@ -55,14 +55,14 @@ pub(super) fn interiors(levels: &Levels<'_>) -> Option<Interiors> {
     let edges = widened(&moves, size, radius);
     let min_pixels = (2 * radius + 1) * (2 * radius + 1);
     let mut inside = vec![false; high.len()];
-    for region in regions(&high, size) {
+    // Small regions are left out first: noise has many, and each of the others costs several filters of the whole image.
+    for region in regions(&high, size).into_iter().filter(|region| region.len() >= min_pixels) {
         let mut part = vec![false; high.len()];
         region.iter().for_each(|pixel| part[*pixel] = true);
         let around = widened(&part, size, 1);
         let outline: Vec<usize> = (0..part.len()).filter(|pixel| around[*pixel] && !part[*pixel]).collect();
         let moving = outline.iter().filter(|pixel| edges[**pixel]).count() as f64;
-        let moves_around = !outline.is_empty() && moving >= MIN_MOVING_OUTLINE * outline.len() as f64;
-        if region.len() >= min_pixels && moves_around {
+        if !outline.is_empty() && moving >= MIN_MOVING_OUTLINE * outline.len() as f64 {
             let margin = widened(&part, size, radius);
             inside.iter_mut().zip(margin).for_each(|(inside, margin)| *inside |= margin);
         }

@@ -19,7 +19,7 @@ use glam::{DVec2, DVec3};
 /// Error of a view's image of a centreline, as a share of the distance to the ridges that [`CONFIDENCE`] of the points have: a point
 /// is the mean of several views, phases and neighbours.
 const OF_RIDGES: f64 = 0.45;
-/// Error where no image tells it, pixels.
+/// Error where there are no images to compare with, pixels.
 const WITHOUT_IMAGES_PX: f64 = 0.1;
 /// Exponent of the stated views' disagreement in the error that calibration leaves.
 const LEFT_EXPONENT: f64 = 0.5;
@@ -45,8 +45,9 @@ const EXISTENCE_OF_MORE: [(f64, f64); 5] = [(0.2, 0.77), (0.49, 0.85), (0.71, 0.
 /// Probability that a point of a single fit exists: with two views, and with more.
 const EXISTENCE_SINGLE: [f64; 2] = [0.61, 0.997];
 
-/// States the doubt about all points of a tree. The dataset has the geometry that the reconstruction used; its stated views disagreed by
-/// so many pixels ([`crate::calibrate::correction::Calibration::disagreement_px`]).
+/// States the doubt about all points of a tree. The dataset has the geometry that the reconstruction used, and
+/// `disagreement_px` is the disagreement of its views as stated ([`crate::calibrate::correction::Calibration::disagreement_px`]). A phase
+/// that the dataset does not have is compared with no image.
 pub fn state_doubt(beat: &mut BeatTree, dataset: &Dataset, disagreement_px: f64) {
     let views = dataset.training_views();
     let Some(first) = views.first() else { return };
@@ -104,7 +105,7 @@ impl FrameView<'_> {
         let here = self.pixels[branch][point]?;
         let ahead = projected(&self.rays, tree.branches[branch].points_mm[point] + tangent)?;
         let across = (ahead - here).perp().try_normalize()?;
-        let change = background.changes[tree.phase as usize].as_ref()?;
+        let change = background.changes.get(tree.phase as usize)?.as_ref()?;
         ridge_offset(change, background.strongest, here, across).map(|offset| offset.abs() as f32)
     }
 }
@@ -228,7 +229,7 @@ mod tests {
 
     #[test]
     fn the_least_certain_direction_is_the_depth_of_rays_that_nearly_coincide() {
-        // Two rays 20 degrees apart about the x axis, and a vessel along z: each tells its perpendicular in the plane.
+        // Two rays 20 degrees apart about the x axis, and a vessel along z: each shows its perpendicular in the plane.
         let (direction, dilution) = least_certain([along(-10.0), along(10.0)].into_iter(), DVec3::Z);
         assert!(direction.dot(DVec3::X).abs() > 0.999, "{direction}");
         let expected = (2.0 * 10f64.to_radians().sin().powi(2)).sqrt().recip();
@@ -236,7 +237,7 @@ mod tests {
         // Rays at right angles are equally good in all directions.
         let (_, dilution) = least_certain([along(0.0), along(90.0)].into_iter(), DVec3::Z);
         assert!((dilution - 1.0).abs() < 1e-9);
-        // A vessel along the plane of both rays: its place in the plane is not told.
+        // A vessel along the plane of both rays: its place in the plane is not shown.
         let (direction, dilution) = least_certain([along(0.0), along(90.0)].into_iter(), DVec3::X);
         assert!(direction.dot(DVec3::Y).abs() > 0.999 && dilution > 0.99, "{direction} {dilution}");
         let (_, limited) = least_certain(std::iter::empty(), DVec3::Z);

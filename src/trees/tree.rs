@@ -21,7 +21,7 @@ pub struct Doubt {
     pub across_mm: f64,
     /// Least certain direction across the vessel, a unit vector (LPS).
     pub direction: DVec3,
-    /// Half width, mm, for the material point, along its least certain direction: also along the vessel, where no view tells motion.
+    /// Half width, mm, for the material point, along its least certain direction: also along the vessel, where no view shows motion.
     /// `None` where points are not followed, or where the reference phase is not among the phases of the tree.
     pub with_motion_mm: Option<f64>,
     /// Probability that a true vessel is within [`EXISTS_WITHIN_MM`], 0 to 1.
