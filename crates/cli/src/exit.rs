@@ -14,7 +14,7 @@ pub const INTERRUPTED: u8 = 130;
 
 /// Ends the process at once, with the exit code of a stop and without partial files, while other threads still work.
 pub fn interrupted() -> ! {
-    files::remove_unfinished();
+    let _no_writing = files::remove_unfinished();
     #[cfg(unix)]
     // SAFETY: the function takes a number and does not return. It calls no exit handlers, which is why it is called: those of a
     // driver free what the threads of the driver still use, and the process would die of a segmentation fault.

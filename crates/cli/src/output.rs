@@ -102,15 +102,21 @@ pub fn write_dataset<T>(out: &Path, force: bool, write: impl FnOnce(&Path) -> Re
             format!("contains `{}`, which this program did not write: choose another directory", shown(&foreign));
         return Err(Error::config("--out", shown(out), problem));
     }
-    let fresh = tempfile::Builder::new().prefix(PARTIAL).tempdir_in(out);
-    let fresh = fresh.map_err(Error::io("create a temporary directory in", out))?;
-    let _unfinished = files::Unfinished::new(fresh.path());
+    let create = || tempfile::Builder::new().prefix(PARTIAL).tempdir_in(out);
+    let (_unfinished, fresh) = files::Unfinished::create(create, tempfile::TempDir::path)
+        .map_err(Error::io("create a temporary directory in", out))?;
     let written = write(fresh.path())?;
-    for path in &old {
+    // A process that ended in the middle would leave neither the old dataset nor the new one.
+    files::undivided(|| replace(&old, fresh.path(), out))?;
+    Ok(written)
+}
+
+/// Removes the files of an earlier dataset and moves those of the new one to their place.
+fn replace(old: &[PathBuf], fresh: &Path, out: &Path) -> Result<()> {
+    for path in old {
         std::fs::remove_file(path).map_err(Error::io("remove", path))?;
     }
-    move_into(fresh.path(), out)?;
-    Ok(written)
+    move_into(fresh, out)
 }
 
 /// Moves all files of a directory into another one, those in folders first: a manifest must not be there before its images.

