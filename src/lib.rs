@@ -223,6 +223,8 @@ pub mod export {
     #[cfg(feature = "dicom")]
     pub mod segmentation;
     pub mod splats;
+    #[cfg(feature = "dicom")]
+    pub mod structured;
     pub mod surfaces;
     pub mod volumes;
 }
@@ -245,6 +247,8 @@ pub mod trees {
     mod follow;
     mod graph;
     pub mod lesions;
+    #[cfg(feature = "dicom")]
+    pub mod measurements;
     pub mod next_view;
     mod radii;
     mod refine;

@@ -6,6 +6,7 @@
 use crate::error::{Error, Result};
 use crate::files;
 use crate::geometry::CArm;
+use dicom_core::value::DataSetSequence;
 use dicom_core::{DataElement, PrimitiveValue, Tag, VR};
 use dicom_dictionary_std::{tags, uids};
 use dicom_object::{FileMetaTableBuilder, InMemDicomObject};
@@ -15,7 +16,7 @@ use std::path::Path;
 const WHITE: f64 = 65535.0;
 const EXPLICIT_LITTLE_ENDIAN: &str = "1.2.840.10008.1.2.1";
 /// Label that viewers show beside the picture, wherever they show text of the file.
-pub(super) const LABEL: &str = "RESEARCH USE ONLY - NOT FOR DIAGNOSIS";
+pub(crate) const LABEL: &str = "RESEARCH USE ONLY - NOT FOR DIAGNOSIS";
 /// Largest number of characters of a decimal string.
 const DECIMAL_CHARACTERS: usize = 16;
 /// Largest size of pixel data of explicit length, bytes.
@@ -114,6 +115,38 @@ pub(super) struct Identity<'a> {
     pub number: u32,
 }
 
+/// A code of a coding scheme (PS3.3 8.8).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Code {
+    /// Value of the code, at most 16 characters.
+    pub value: &'static str,
+    /// Designator of its scheme.
+    pub scheme: &'static str,
+    /// Text for people, at most 64 characters.
+    pub meaning: &'static str,
+}
+
+impl Code {
+    /// Returns the item of a code sequence.
+    pub fn item(&self) -> InMemDicomObject {
+        let mut item = InMemDicomObject::new_empty();
+        add_text(&mut item, tags::CODE_VALUE, VR::SH, self.value);
+        add_text(&mut item, tags::CODING_SCHEME_DESIGNATOR, VR::SH, self.scheme);
+        add_text(&mut item, tags::CODE_MEANING, VR::LO, self.meaning);
+        item
+    }
+}
+
+/// Category of what is segmented and measured.
+pub(crate) const ANATOMY: Code = Code { value: "123037004", scheme: "SCT", meaning: "Anatomical Structure" };
+/// Vessels that are segmented and measured.
+pub(crate) const CORONARY: Code = Code { value: "41801008", scheme: "SCT", meaning: "Coronary artery" };
+
+/// Adds a sequence.
+pub(super) fn add_sequence(object: &mut InMemDicomObject, tag: Tag, items: Vec<InMemDicomObject>) {
+    object.put(DataElement::new(tag, VR::SQ, DataSetSequence::from(items)));
+}
+
 /// Adds what all our objects share: the identity of the object, the patient and the manufacturer.
 pub(super) fn identify(object: &mut InMemDicomObject, identity: &Identity<'_>) {
     for (tag, vr) in [
@@ -135,7 +168,6 @@ pub(super) fn identify(object: &mut InMemDicomObject, identity: &Identity<'_>) {
         (tags::STUDY_INSTANCE_UID, VR::UI, study),
         (tags::SERIES_INSTANCE_UID, VR::UI, series),
         (tags::MODALITY, VR::CS, identity.modality),
-        (tags::BODY_PART_EXAMINED, VR::CS, "HEART"),
         (tags::PATIENT_NAME, VR::PN, "RESEARCH^RECONSTRUCTION"),
         (tags::PATIENT_ID, VR::LO, "RESEARCH"),
         (tags::STUDY_DESCRIPTION, VR::LO, LABEL),
@@ -145,10 +177,17 @@ pub(super) fn identify(object: &mut InMemDicomObject, identity: &Identity<'_>) {
         (tags::MANUFACTURER, VR::LO, "nertca-vk"),
         (tags::MANUFACTURER_MODEL_NAME, VR::LO, "nertca-vk"),
         (tags::SOFTWARE_VERSIONS, VR::LO, env!("CARGO_PKG_VERSION")),
-        (tags::BURNED_IN_ANNOTATION, VR::CS, "NO"),
-        (tags::LOSSY_IMAGE_COMPRESSION, VR::CS, "00"),
     ] {
         add_text(object, tag, vr, value);
+    }
+}
+
+/// Adds what our images share beyond [`identify`].
+pub(super) fn describe_image(object: &mut InMemDicomObject) {
+    for (tag, value) in
+        [(tags::BODY_PART_EXAMINED, "HEART"), (tags::BURNED_IN_ANNOTATION, "NO"), (tags::LOSSY_IMAGE_COMPRESSION, "00")]
+    {
+        add_text(object, tag, VR::CS, value);
     }
 }
 
@@ -157,6 +196,7 @@ fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
     let [study, series, image] = view.seeds.map(uid);
     let class = uids::X_RAY_ANGIOGRAPHIC_IMAGE_STORAGE;
     identify(object, &Identity { class, uids: [&study, &series, &image], modality: "XA", number: 1 });
+    describe_image(object);
     for (tag, vr) in [
         (tags::PATIENT_ORIENTATION, VR::CS),
         (tags::KVP, VR::DS),

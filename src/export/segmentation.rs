@@ -4,10 +4,12 @@
 //! There are no references to source runs, because a dataset contains none of their UIDs.
 
 use crate::error::{Error, Result};
-use crate::export::dicom::{Identity, LABEL, add_text, add_unknown, decimal, identify, uid, write_object};
+use crate::export::dicom::{
+    ANATOMY, CORONARY, Identity, LABEL, add_sequence, add_text, add_unknown, decimal, describe_image, identify, uid,
+    write_object,
+};
 use crate::render::grid::PatientGrid;
 use dicom_core::chrono::{DateTime, Utc};
-use dicom_core::value::DataSetSequence;
 use dicom_core::{DataElement, PrimitiveValue, Tag, VR};
 use dicom_dictionary_std::tags;
 use dicom_dictionary_std::uids::SEGMENTATION_STORAGE;
@@ -19,18 +21,6 @@ use std::time::SystemTime;
 const RED_LAB: [u16; 3] = [34_885, 53_485, 50_171];
 /// Axes of columns and rows: left and posterior.
 const ORIENTATION: &str = "1\\0\\0\\0\\1\\0";
-
-/// A code of a coding scheme.
-struct Code {
-    value: &'static str,
-    scheme: &'static str,
-    meaning: &'static str,
-}
-
-/// Category of what is segmented.
-const ANATOMY: Code = Code { value: "123037004", scheme: "SCT", meaning: "Anatomical Structure" };
-/// Type of what is segmented.
-const CORONARY: Code = Code { value: "41801008", scheme: "SCT", meaning: "Coronary artery" };
 
 /// Vessels of a phase.
 #[derive(Debug, Clone)]
@@ -116,19 +106,6 @@ fn packed(bits: &[bool]) -> Vec<u8> {
     bytes
 }
 
-fn add_sequence(object: &mut InMemDicomObject, tag: Tag, items: Vec<InMemDicomObject>) {
-    object.put(DataElement::new(tag, VR::SQ, DataSetSequence::from(items)));
-}
-
-/// Returns the item of a code sequence.
-fn code(code: &Code) -> InMemDicomObject {
-    let mut item = InMemDicomObject::new_empty();
-    add_text(&mut item, tags::CODE_VALUE, VR::SH, code.value);
-    add_text(&mut item, tags::CODING_SCHEME_DESIGNATOR, VR::SH, code.scheme);
-    add_text(&mut item, tags::CODE_MEANING, VR::LO, code.meaning);
-    item
-}
-
 /// Adds the identity and the description of a segmentation.
 fn describe(object: &mut InMemDicomObject, segmentation: &Segmentation<'_>) {
     let SegmentationSeeds { study, series, frame, instance, .. } = segmentation.seeds;
@@ -136,6 +113,7 @@ fn describe(object: &mut InMemDicomObject, segmentation: &Segmentation<'_>) {
     let Segmentation { phase, n_phases, .. } = segmentation;
     let uids = [study.as_str(), &series, &instance];
     identify(object, &Identity { class: SEGMENTATION_STORAGE, uids, modality: "SEG", number: phase + 1 });
+    describe_image(object);
     add_unknown(object, tags::POSITION_REFERENCE_INDICATOR, VR::LO);
     add_unknown(object, tags::CONTENT_CREATOR_NAME, VR::PN);
     let now = DateTime::<Utc>::from(SystemTime::now());
@@ -165,8 +143,8 @@ fn segment(segmentation: &Segmentation<'_>) -> InMemDicomObject {
     add_text(&mut item, tags::SEGMENT_DESCRIPTION, VR::ST, &description);
     add_text(&mut item, tags::SEGMENT_ALGORITHM_TYPE, VR::CS, "AUTOMATIC");
     add_text(&mut item, tags::SEGMENT_ALGORITHM_NAME, VR::LO, "nertca-vk");
-    add_sequence(&mut item, tags::SEGMENTED_PROPERTY_CATEGORY_CODE_SEQUENCE, vec![code(&ANATOMY)]);
-    add_sequence(&mut item, tags::SEGMENTED_PROPERTY_TYPE_CODE_SEQUENCE, vec![code(&CORONARY)]);
+    add_sequence(&mut item, tags::SEGMENTED_PROPERTY_CATEGORY_CODE_SEQUENCE, vec![ANATOMY.item()]);
+    add_sequence(&mut item, tags::SEGMENTED_PROPERTY_TYPE_CODE_SEQUENCE, vec![CORONARY.item()]);
     let colour = PrimitiveValue::U16(RED_LAB.to_vec().into());
     item.put(DataElement::new(tags::RECOMMENDED_DISPLAY_CIE_LAB_VALUE, VR::US, colour));
     item

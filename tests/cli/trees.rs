@@ -22,7 +22,9 @@ fn the_tree_is_the_true_one_in_every_format() {
     // The script also reads the truth and the data, which are beside the run.
     let Trained { directory, run, .. } = trained();
     let to = |name: &str| directory.path().join(name);
-    for (name, files) in [("beat.json", 1), ("beat.vtp", PHASES + 1), ("beat.swc", PHASES), ("beat.glb", 1)] {
+    for (name, files) in
+        [("beat.json", 1), ("beat.vtp", PHASES + 1), ("beat.swc", PHASES), ("beat.glb", 1), ("beat.dcm", 1)]
+    {
         let (made, said) = ok(&["tree", text(run), "-o", text(&to(name))]);
         assert_eq!(made.lines().count(), files, "{made}");
         assert!(made.lines().all(|file| Path::new(file).is_file()));
@@ -32,6 +34,7 @@ fn the_tree_is_the_true_one_in_every_format() {
     assert_eq!(one.trim(), text(&to("one.vtp")), "one phase is one file, under its own name");
     check("check_trees.py", &[directory.path()]);
     check("check_tubes.py", &[&to("beat.glb"), &to("beat.json")]);
+    check("check_measurements.py", &[&to("beat.dcm"), &to("beat.json")]);
     for name in ["still.json", "still.glb"] {
         ok(&["tree", text(run), "-o", text(&to(name)), "--phase", "2"]);
     }
@@ -62,6 +65,9 @@ fn fields_that_carry_no_points_are_not_tracked() {
     let tubes = directory.path().join("sets.glb");
     ok(&["tree", text(&run), "-o", text(&tubes)]);
     check("check_tubes.py", &[&tubes, &file]);
+    let measurements = directory.path().join("sets.dcm");
+    ok(&["tree", text(&run), "-o", text(&measurements)]);
+    check("check_measurements.py", &[&measurements, &file]);
     let tree = tree_of(&run, &file, &["--phase", "1"]);
     assert_eq!((&tree["tracked"], &tree["reference_phase"]), (&json!(false), &Value::Null));
     assert!(tree["note"].as_str().unwrap().starts_with("not tracked"));

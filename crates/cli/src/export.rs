@@ -2,7 +2,7 @@
 
 use super::data::bar;
 use super::options::{GlobalOptions, choice};
-use super::output::{Earlier, random_numbers, write_dataset};
+use super::output::{Earlier, numbers_of_checkpoint, random_numbers, write_dataset};
 use clap::Args;
 use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
@@ -190,7 +190,8 @@ fn write_segmentations(
         None => vessel_threshold_per_mm(renderer, model, grid)?,
     };
     let earlier = earlier(args, phases.len() > 1)?;
-    let [study, series, frame] = random_numbers()?;
+    let [study, frame] = numbers_of_checkpoint(&args.run)?;
+    let [series] = random_numbers()?;
     let rule = format!("attenuation above {iso_per_mm:.4e} per mm, {} iterations", model.step);
     let mut made = Vec::new();
     for phase in phases {

@@ -2,8 +2,10 @@
 //! given; then all of it makes way, so that no old file is mistaken for a part of the new result.
 
 use nertca_vk::calibrate::correction;
+use nertca_vk::checkpoint::newest;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
+use nertca_vk::fingerprint::Fingerprint;
 use nertca_vk::phantom::tree_file::TREE;
 use nertca_vk::scan::dataset::MANIFEST;
 use nertca_vk::scan::nerfca;
@@ -217,4 +219,23 @@ pub fn random_numbers<const N: usize>() -> Result<[u128; N]> {
         getrandom::fill(number).map_err(|e| Error::Internal(format!("random numbers could not be obtained: {e}")))?;
     }
     Ok(bytes.map(u128::from_le_bytes))
+}
+
+/// Returns numbers that a model's checkpoint alone determines, so that files which are made of it at different times have the study and
+/// the frame of reference in common. `run` is a run directory or a checkpoint file.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn numbers_of_checkpoint<const N: usize>(run: &Path) -> Result<[u128; N]> {
+    let file = newest(run)?;
+    let bytes = std::fs::read(&file).map_err(Error::io("read", &file))?;
+    let half = |number: usize, half: u32| {
+        let mut fingerprint = Fingerprint::default();
+        fingerprint.word(2 * number as u32 + half);
+        bytes
+            .chunks(4)
+            .for_each(|four| fingerprint.word(four.iter().fold(0, |word, byte| word << 8 | u32::from(*byte))));
+        u128::from(fingerprint.value())
+    };
+    Ok(std::array::from_fn(|number| half(number, 0) << 64 | half(number, 1)))
 }

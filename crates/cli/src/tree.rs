@@ -3,11 +3,12 @@
 use super::data::bar;
 use super::export::phases;
 use super::options::GlobalOptions;
-use super::output::Earlier;
+use super::output::{Earlier, numbers_of_checkpoint, random_numbers};
 use clap::Args;
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::checkpoint::newest_model;
 use nertca_vk::error::{Error, Result};
+use nertca_vk::export::structured::ReportSeeds;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::model::Model;
 use nertca_vk::raster::percentile;
@@ -21,6 +22,7 @@ use nertca_vk::trees::doubt::state_doubt;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
 use nertca_vk::trees::lesions::{Lesion, lesions};
+use nertca_vk::trees::measurements;
 use nertca_vk::trees::tree::{BeatTree, CONFIDENCE, DOUBTFUL, TreeView};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -47,8 +49,8 @@ pub struct TreeArgs {
     #[arg(short, long)]
     pub force: bool,
     /// Output: .json (all phases), .vtp (one file per phase, and a .pvd that lists them, for ParaView, 3D Slicer and
-    /// VMTK), .swc (one file per phase), in millimetres along (left, posterior, superior); or .glb (tubes, animated
-    /// over the beat; metres).
+    /// VMTK), .swc (one file per phase), in millimetres along (left, posterior, superior); .glb (tubes, animated
+    /// over the beat; metres); or .dcm (lengths, diameters and stenoses of all phases as a DICOM structured report).
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
 }
@@ -184,20 +186,47 @@ pub fn training_views(run: &Path, lacking: &str) -> Vec<TreeView> {
     })
 }
 
+/// Kind of file to which a tree is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Output {
+    Tree(TreeFormat),
+    /// DICOM structured report.
+    Measurements,
+}
+
+impl Output {
+    /// Returns the kind by the extension of a file name.
+    fn of(path: &Path) -> Option<Output> {
+        let is_dicom = path.extension().is_some_and(|end| end.eq_ignore_ascii_case("dcm"));
+        if is_dicom { Some(Output::Measurements) } else { TreeFormat::of(path).map(Output::Tree) }
+    }
+}
+
+/// Writes the measurements of a tree and returns the file.
+fn write_measurements(beat: &BeatTree, args: &TreeArgs) -> Result<Vec<PathBuf>> {
+    let [study, frame] = numbers_of_checkpoint(&args.run)?;
+    let [series, instance, tracking] = random_numbers()?;
+    measurements::write(beat, &args.out, &ReportSeeds { study, series, frame, instance, tracking })?;
+    Ok(vec![args.out.clone()])
+}
+
 /// Finds the vessels of a run as trees and writes them.
 pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
-    let unknown = || Error::config("--out", args.out.display(), "does not end in one of .json .vtp .swc .glb");
-    let format = TreeFormat::of(&args.out).ok_or_else(unknown)?;
+    let unknown = || Error::config("--out", args.out.display(), "does not end in one of .json .vtp .swc .glb .dcm");
+    let format = Output::of(&args.out).ok_or_else(unknown)?;
     let model = newest_model(&args.run)?;
     let (phases, all) = phases(&args.phase, &model)?;
-    let several = all && matches!(format, TreeFormat::Vtp | TreeFormat::Swc);
+    let several = all && matches!(format, Output::Tree(TreeFormat::Vtp | TreeFormat::Swc));
     let earlier = if several { Earlier::series(&args.out, args.force)? } else { Earlier::none() };
     let gpu = global.open_device()?;
     let options = TreeOptions { phases, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
     // Ctrl-C may end the program at once, because no partial result has been written here.
     let mut beat = find(global, &gpu, &model, &AtomicBool::new(false), &options)?;
     compare_with_run(&mut beat, &args.run);
-    let made = write(&beat, &args.out, format, all)?;
+    let made = match format {
+        Output::Tree(format) => write(&beat, &args.out, format, all)?,
+        Output::Measurements => write_measurements(&beat, args)?,
+    };
     earlier.make_way(&made)?;
     made.iter().for_each(|path| out!("{}", path.display()));
     for tree in &beat.phases {
