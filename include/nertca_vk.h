@@ -213,6 +213,11 @@ typedef struct nertca_context nertca_context;
 typedef struct nertca_reconstruction nertca_reconstruction;
 
 /**
+ * A semaphore of the device that other APIs and processes can import.
+ */
+typedef struct nertca_semaphore nertca_semaphore;
+
+/**
  * Result of a call: 0 for success, negative for an error whose text `nertca_last_error` returns.
  */
 typedef int32_t nertca_status;
@@ -308,6 +313,10 @@ typedef struct {
    * has kernels for the device's shapes. Requires `subgroup_size_control` as well.
    */
   uint32_t cooperative_matrix;
+  /**
+   * Non-zero when the device was made with `VK_KHR_external_semaphore_fd`.
+   */
+  uint32_t external_semaphore_fd;
 } nertca_vulkan;
 
 /**
@@ -1068,7 +1077,7 @@ nertca_status nertca_devices(char *text, size_t size, size_t *length);
  *
  * Waits for calls on the context in other threads.
  *
- * @return NERTCA_ERROR_BUSY, with nothing done, while reconstructions or buffers made from it exist, or from inside a callback
+ * @return NERTCA_ERROR_BUSY, with nothing done, while reconstructions, buffers or semaphores made from it exist, or from inside a callback
  * of a call on it.
  *
  * # Safety
@@ -1476,6 +1485,43 @@ nertca_status nertca_buffer_export_fd(nertca_buffer *buffer,
  * the buffer in other threads.
  */
 nertca_status nertca_buffer_destroy(nertca_buffer *buffer);
+
+/**
+ * Makes a binary semaphore on the device that can be shared through `VK_KHR_external_semaphore_fd`. `*semaphore` is null on
+ * failure. Callable from any thread.
+ *
+ * @return NERTCA_ERROR_DEVICE where the device lacks the extension (`external_semaphore_fd` of `nertca_context_describe`).
+ *
+ * # Safety
+ * `semaphore` must be writable.
+ */
+nertca_status nertca_semaphore_create(nertca_context *context,
+                                      nertca_semaphore **semaphore);
+
+/**
+ * Returns a new file descriptor of the semaphore (`VK_EXTERNAL_SEMAPHORE_HANDLE_TYPE_OPAQUE_FD_BIT`), which the caller must import
+ * or close. Callable from any thread.
+ *
+ * # Safety
+ * `fd` must be writable.
+ */
+nertca_status nertca_semaphore_export_fd(nertca_semaphore *semaphore,
+                                         int32_t *fd);
+
+/**
+ * Signals the semaphore on the device's queue, after the work of all calls that have returned: a picture in a shared buffer, for
+ * example, is then visible to the commands of another device that wait for the semaphore. The call does not wait. Each signal must be
+ * waited for once before the next. Callable from any thread.
+ *
+ * @return NERTCA_ERROR_DEVICE_LOST where the device no longer works.
+ */
+nertca_status nertca_semaphore_signal(nertca_semaphore *semaphore);
+
+/**
+ * Destroys a semaphore, after its last signal; what others imported stays valid for them. Null is allowed, and does nothing. Waits for
+ * calls on the semaphore in other threads.
+ */
+nertca_status nertca_semaphore_destroy(nertca_semaphore *semaphore);
 
 /**
  * Finds the vessels at all phases as trees of centrelines with radii. If all arrays of `tree` are null, the call searches and

@@ -326,6 +326,7 @@ pub mod capi {
     pub mod options;
     pub mod output;
     pub mod reconstruction;
+    pub mod semaphores;
     mod shared_memory;
     pub mod status;
     pub mod training;

@@ -263,6 +263,7 @@ pub unsafe extern "C" fn nertca_context_adopt(
             queue_family: theirs.queue_family,
             buffer_device_address: theirs.buffer_device_address != 0,
             external_memory_fd: theirs.external_memory_fd != 0,
+            external_semaphore_fd: theirs.external_semaphore_fd != 0,
             subgroup_size_control: theirs.subgroup_size_control != 0,
             cooperative_matrix: theirs.cooperative_matrix != 0,
             queue_lock,
@@ -317,7 +318,7 @@ pub unsafe extern "C" fn nertca_devices(text: *mut c_char, size: usize, length: 
 ///
 /// Waits for calls on the context in other threads.
 ///
-/// @return NERTCA_ERROR_BUSY, with nothing done, while reconstructions or buffers made from it exist, or from inside a callback
+/// @return NERTCA_ERROR_BUSY, with nothing done, while reconstructions, buffers or semaphores made from it exist, or from inside a callback
 /// of a call on it.
 ///
 /// # Safety
@@ -333,8 +334,9 @@ pub unsafe extern "C" fn nertca_context_destroy(context: *mut nertca_context) ->
         }
         let children = handles::get::<Context, nertca_context>(context)?.children.load(Ordering::Acquire);
         if children > 0 {
-            let problem =
-                format!("context: {children} reconstructions or buffers that were created from it still exist");
+            let problem = format!(
+                "context: {children} reconstructions, buffers or semaphores that were created from it still exist"
+            );
             return Err(Failure::new(NERTCA_ERROR_BUSY, problem));
         }
         let context = handles::remove::<Context, nertca_context>(context)?;

@@ -111,6 +111,8 @@ pub struct nertca_vulkan {
     /// `shaderFloat16`, `vulkanMemoryModel` and `vulkanMemoryModelDeviceScope`: networks then use matrices, where the library
     /// has kernels for the device's shapes. Requires `subgroup_size_control` as well.
     pub cooperative_matrix: u32,
+    /// Non-zero when the device was made with `VK_KHR_external_semaphore_fd`.
+    pub external_semaphore_fd: u32,
 }
 
 /// Geometry of an image. Patient coordinates are left, posterior, superior (LPS), mm, from the isocentre.

@@ -40,6 +40,7 @@ fn the_header_is_generated() {
         "calibration",
         "training",
         "output",
+        "semaphores",
         "tree",
         "truth",
     ];

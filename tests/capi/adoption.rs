@@ -5,6 +5,7 @@ use crate::c_scene::*;
 use ash::vk::{self, Handle};
 use nertca_vk::capi::context::*;
 use nertca_vk::capi::output::*;
+use nertca_vk::capi::semaphores::*;
 use nertca_vk::capi::status::*;
 use nertca_vk::capi::types::*;
 use std::ffi::{CString, c_void};
@@ -51,6 +52,7 @@ struct Application {
     with: With,
     addresses: bool,
     exports: bool,
+    waits: bool,
     uses: Box<Uses>,
     messages: Box<std::sync::Mutex<Vec<String>>>,
     debug: (ash::ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT),
@@ -92,6 +94,7 @@ impl Application {
             let known = instance.enumerate_device_extension_properties(physical).unwrap();
             let has = |name| known.iter().any(|e| e.extension_name_as_c_str() == Ok(name));
             let exports = has(ash::khr::external_memory_fd::NAME);
+            let waits = has(ash::khr::external_semaphore_fd::NAME);
             let wanted = match with {
                 With::Least => &[][..],
                 With::Subgroups => &[ash::ext::subgroup_size_control::NAME],
@@ -100,6 +103,9 @@ impl Application {
             let mut names: Vec<_> = wanted.iter().map(|name| name.as_ptr()).collect();
             if exports {
                 names.push(ash::khr::external_memory_fd::NAME.as_ptr());
+            }
+            if waits {
+                names.push(ash::khr::external_semaphore_fd::NAME.as_ptr());
             }
             let mut offered = vk::PhysicalDeviceVulkan12Features::default();
             let mut of_device = vk::PhysicalDeviceFeatures2::default().push_next(&mut offered);
@@ -137,7 +143,19 @@ impl Application {
                 return None;
             };
             let uses = Box::default();
-            Some(Application { entry, instance, physical, device, with, addresses, exports, uses, messages, debug })
+            Some(Application {
+                entry,
+                instance,
+                physical,
+                device,
+                with,
+                addresses,
+                exports,
+                waits,
+                uses,
+                messages,
+                debug,
+            })
         }
     }
 
@@ -158,6 +176,7 @@ impl Application {
             user: std::ptr::from_ref(&*self.uses).cast_mut().cast(),
             subgroup_size_control: (self.with != With::Least).into(),
             cooperative_matrix: (self.with == With::Matrices).into(),
+            external_semaphore_fd: self.waits.into(),
         }
     }
 
@@ -170,6 +189,29 @@ impl Application {
             self.instance.destroy_instance(None);
         }
         assert_eq!(*self.messages.lock().unwrap(), Vec::<String>::new());
+    }
+
+    /// Imports the semaphore of a descriptor, and lets the device wait for it.
+    fn wait_for(&self, fd: i32) {
+        /// A signal that was submitted arrives long before, in nanoseconds.
+        const PATIENCE: u64 = 60_000_000_000;
+        unsafe {
+            let semaphore = self.device.create_semaphore(&vk::SemaphoreCreateInfo::default(), None).unwrap();
+            let import = vk::ImportSemaphoreFdInfoKHR::default()
+                .semaphore(semaphore)
+                .handle_type(vk::ExternalSemaphoreHandleTypeFlags::OPAQUE_FD)
+                .fd(fd);
+            let imports = ash::khr::external_semaphore_fd::Device::new(&self.instance, &self.device);
+            imports.import_semaphore_fd(&import).unwrap();
+            let fence = self.device.create_fence(&vk::FenceCreateInfo::default(), None).unwrap();
+            let (semaphores, stages) = ([semaphore], [vk::PipelineStageFlags::ALL_COMMANDS]);
+            let submit = vk::SubmitInfo::default().wait_semaphores(&semaphores).wait_dst_stage_mask(&stages);
+            let queue = self.device.get_device_queue(0, 0);
+            self.device.queue_submit(queue, &[submit], fence).unwrap();
+            self.device.wait_for_fences(&[fence], true, PATIENCE).expect("the semaphore was signalled");
+            self.device.destroy_fence(fence, None);
+            self.device.destroy_semaphore(semaphore, None);
+        }
     }
 
     /// Reads the memory of a descriptor, imported as another API would.
@@ -308,5 +350,45 @@ fn a_device_is_shared_with_its_owner() {
     let Uses { locked, unlocked } = &*application.uses;
     assert!(locked.load(Ordering::SeqCst) > 5);
     assert_eq!(locked.load(Ordering::SeqCst), unlocked.load(Ordering::SeqCst));
+    application.close();
+}
+
+/// A device that the library opened draws; the application's device waits for the picture on its own queue, and reads it.
+#[test]
+fn another_device_waits_for_a_picture() {
+    let required = std::env::var_os("NERTCA_SEMAPHORES").is_some();
+    let application = Application::new(With::Least).unwrap();
+    let context = context("validation = true");
+    if !(application.exports && application.waits) {
+        assert!(!required, "this driver is known to export semaphores");
+        let mut semaphore = null_mut();
+        let status = unsafe { nertca_semaphore_create(context, &mut semaphore) };
+        assert_eq!((status, semaphore), (NERTCA_ERROR_DEVICE, null_mut()));
+        println!("{}: semaphores were not tested", last_error(context));
+        close(context, &[]);
+        return application.close();
+    }
+    let made = reconstruction(context, SMALL);
+    add_frames(made, 0..3);
+    train(made, 3);
+    let bytes = u64::from(SIZE * SIZE * 4);
+    let (mut buffer, mut semaphore, mut size) = (null_mut(), null_mut(), 0);
+    ok(unsafe { nertca_buffer_create(context, bytes, &mut buffer) }, context);
+    ok(unsafe { nertca_semaphore_create(context, &mut semaphore) }, context);
+    // A signal that was waited for can be given again.
+    for at in [1, 2] {
+        let ours = drawn(made, &view(at));
+        let (mut memory, mut signal) = (-1, -1);
+        ok(unsafe { nertca_reconstruction_render_buffer(made, &view(at), buffer) }, made);
+        ok(nertca_semaphore_signal(semaphore), semaphore);
+        ok(unsafe { nertca_semaphore_export_fd(semaphore, &mut signal) }, semaphore);
+        ok(unsafe { nertca_buffer_export_fd(buffer, &mut memory, &mut size) }, buffer);
+        application.wait_for(signal);
+        assert_eq!(application.import(memory, size)[..ours.len()], ours, "view {at}");
+    }
+    assert_eq!(unsafe { nertca_context_destroy(context) }, NERTCA_ERROR_BUSY);
+    ok(nertca_semaphore_destroy(semaphore), semaphore);
+    ok(nertca_buffer_destroy(buffer), buffer);
+    close(context, &[made]);
     application.close();
 }

@@ -8,6 +8,7 @@ use nertca_vk::capi::calibration::*;
 use nertca_vk::capi::context::*;
 use nertca_vk::capi::output::*;
 use nertca_vk::capi::reconstruction::*;
+use nertca_vk::capi::semaphores::*;
 use nertca_vk::capi::status::*;
 use nertca_vk::capi::training::*;
 use nertca_vk::capi::tree::*;
@@ -76,6 +77,7 @@ fn every_function_refuses_what_it_cannot_use() {
     views(&b);
     volumes_and_scores(&b);
     buffers(&b);
+    semaphores(&b);
     texts(&b);
     let header = std::fs::read_to_string(root().join("include/nertca_vk.h")).unwrap();
     let functions: BTreeSet<String> = header
@@ -705,6 +707,33 @@ fn buffers(b: &Bench) {
     });
     b.handles("nertca_buffer_destroy", buffer, b.context.cast(), |h| nertca_buffer_destroy(h));
     ok(nertca_buffer_destroy(null_mut()), null::<c_void>());
+}
+
+fn semaphores(b: &Bench) {
+    let create = "nertca_semaphore_create";
+    b.handles(create, stale_context(), b.bare.cast(), |h| unsafe { nertca_semaphore_create(h, &mut null_mut()) });
+    b.refuses(create, NERTCA_ERROR_ARGUMENT, "semaphore", unsafe { nertca_semaphore_create(b.context, null_mut()) });
+    let without = context("device = none");
+    b.refuses(create, NERTCA_ERROR_DEVICE, "without a device", unsafe {
+        nertca_semaphore_create(without, &mut null_mut())
+    });
+    ok(unsafe { nertca_context_destroy(without) }, without);
+    let mut semaphore = null_mut();
+    if unsafe { nertca_semaphore_create(b.context, &mut semaphore) } == NERTCA_OK {
+        b.refuses("nertca_semaphore_export_fd", NERTCA_ERROR_ARGUMENT, "fd", unsafe {
+            nertca_semaphore_export_fd(semaphore, null_mut())
+        });
+        ok(nertca_semaphore_destroy(semaphore), semaphore);
+    } else {
+        println!("this device exports no semaphores: {}", last_error(b.context));
+        semaphore = without_provenance_mut(0x1234_5678);
+    }
+    b.handles("nertca_semaphore_export_fd", semaphore, b.context.cast(), |h| unsafe {
+        nertca_semaphore_export_fd(h, &mut 0)
+    });
+    b.handles("nertca_semaphore_signal", semaphore, b.context.cast(), |h| nertca_semaphore_signal(h));
+    b.handles("nertca_semaphore_destroy", semaphore, b.context.cast(), |h| nertca_semaphore_destroy(h));
+    ok(nertca_semaphore_destroy(null_mut()), null::<c_void>());
 }
 
 fn texts(b: &Bench) {

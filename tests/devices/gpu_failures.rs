@@ -76,6 +76,9 @@ fn use_device(gpu: &Gpu) -> Result<()> {
     if info.external_memory_fd {
         drop(gpu.exported_buffer("exported", 256)?);
     }
+    if info.external_semaphore_fd {
+        gpu.wait(gpu.exported_semaphore()?.signal()?)?;
+    }
     if let Some(shape) = info.matrices.first() {
         let spec = [("m", shape.m), ("n", shape.n), ("k", shape.k), ("subgroups", 1)];
         drop(gpu.matrix_pipeline(kernel_code("peak_matrix")?, info.subgroup_size, &spec)?);

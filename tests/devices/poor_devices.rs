@@ -163,6 +163,7 @@ fn adopt(poor: Poor, subgroup_size_control: bool, cooperative_matrix: bool) -> R
             queue_family: 0,
             buffer_device_address: false,
             external_memory_fd: false,
+            external_semaphore_fd: false,
             subgroup_size_control,
             cooperative_matrix,
             queue_lock: None,

@@ -80,6 +80,8 @@ pub struct DeviceInfo {
     pub int64_atomics: bool,
     /// Whether memory can be exported as file descriptors (`VK_KHR_external_memory_fd`).
     pub external_memory_fd: bool,
+    /// Whether semaphores can be exported as file descriptors (`VK_KHR_external_semaphore_fd`).
+    pub external_semaphore_fd: bool,
     /// Whether the driver reports statistics of the pipelines it compiles (`VK_KHR_pipeline_executable_properties`).
     pub pipeline_statistics: bool,
     /// Whether the driver implements Vulkan on top of another interface, as on macOS (`VK_KHR_portability_subset`).
@@ -330,6 +332,17 @@ fn usable_shapes(found: &[vk::CooperativeMatrixPropertiesKHR<'_>]) -> Vec<Matrix
     shapes
 }
 
+/// Tells whether a device exports binary semaphores as opaque file descriptors, by which another device can import them.
+fn exports_semaphores(instance: &ash::Instance, physical: vk::PhysicalDevice) -> bool {
+    let asked =
+        vk::PhysicalDeviceExternalSemaphoreInfo::default().handle_type(vk::ExternalSemaphoreHandleTypeFlags::OPAQUE_FD);
+    let mut offered = vk::ExternalSemaphoreProperties::default();
+    // SAFETY: callers take `physical` from this instance, and the function belongs to Vulkan 1.1.
+    unsafe { instance.get_physical_device_external_semaphore_properties(physical, &asked, &mut offered) };
+    let needed = vk::ExternalSemaphoreFeatureFlags::EXPORTABLE | vk::ExternalSemaphoreFeatureFlags::IMPORTABLE;
+    offered.external_semaphore_features.contains(needed)
+}
+
 pub(super) fn describe(
     entry: &ash::Entry,
     instance: &ash::Instance,
@@ -442,6 +455,7 @@ pub(super) fn describe(
         float_atomics: has(ext::shader_atomic_float::NAME),
         int64_atomics,
         external_memory_fd: has(khr::external_memory_fd::NAME),
+        external_semaphore_fd: has(khr::external_semaphore_fd::NAME) && exports_semaphores(instance, physical),
         pipeline_statistics: has(khr::pipeline_executable_properties::NAME)
             && statistics.pipeline_executable_info == vk::TRUE,
         portability_subset: has(khr::portability_subset::NAME),

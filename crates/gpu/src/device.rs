@@ -56,6 +56,8 @@ pub struct Adoption {
     pub buffer_device_address: bool,
     /// Whether the device was made with `VK_KHR_external_memory_fd`.
     pub external_memory_fd: bool,
+    /// Whether the device was made with `VK_KHR_external_semaphore_fd`.
+    pub external_semaphore_fd: bool,
     /// Whether the device was made with the features `subgroupSizeControl` and `computeFullSubgroups`, of
     /// `VK_EXT_subgroup_size_control` or Vulkan 1.3.
     pub subgroup_size_control: bool,
@@ -254,6 +256,9 @@ impl Device {
         if info.external_memory_fd {
             extensions.push(khr::external_memory_fd::NAME.as_ptr());
         }
+        if info.external_semaphore_fd {
+            extensions.push(khr::external_semaphore_fd::NAME.as_ptr());
+        }
         if info.portability_subset {
             extensions.push(khr::portability_subset::NAME.as_ptr());
         }
@@ -412,6 +417,7 @@ impl Gpu {
             info.timestamp_period_ns = 0.0;
         }
         info.external_memory_fd &= adoption.external_memory_fd;
+        info.external_semaphore_fd &= adoption.external_semaphore_fd;
         // Without 64-bit atomics, pairs of 32-bit integers give the same sums.
         info.int64_atomics = false;
         if !adoption.cooperative_matrix {

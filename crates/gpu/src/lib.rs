@@ -13,6 +13,8 @@ pub mod memory;
 pub mod pace;
 pub mod pipeline;
 pub mod record;
+#[cfg(unix)]
+pub mod semaphore;
 pub mod sensors;
 pub mod statistics;
 mod transfer;

@@ -516,28 +516,67 @@ impl Recording {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Ticket(u64);
 
+impl Ticket {
+    /// Returns the value that the device's timeline has after this point.
+    #[cfg(unix)]
+    pub(super) fn value(self) -> u64 {
+        self.0
+    }
+}
+
+/// Work of a submit: commands, and a binary semaphore that is signalled after them.
+#[derive(Default)]
+struct Work {
+    commands: Option<vk::CommandBuffer>,
+    signalled: Option<vk::Semaphore>,
+}
+
+impl Shared {
+    /// Submits work to the device, after all that was submitted before.
+    ///
+    /// # Safety
+    /// The commands must be ended and alive until the submit is complete, as the semaphore must, which no submit may wait for or signal
+    /// at the same time.
+    unsafe fn submit(&self, work: &Work, name: &str) -> Result<Ticket> {
+        let queue = self.locked_queue();
+        let value = self.last_submitted.load(Ordering::Acquire) + 1;
+        // The value of a binary semaphore is ignored.
+        let (mut values, mut semaphores) = (vec![value], vec![self.timeline]);
+        if let Some(signalled) = work.signalled {
+            values.push(0);
+            semaphores.push(signalled);
+        }
+        let mut timeline = vk::TimelineSemaphoreSubmitInfo::default().signal_semaphore_values(&values);
+        let submit = [vk::SubmitInfo::default()
+            .command_buffers(work.commands.as_slice())
+            .signal_semaphores(&semaphores)
+            .push_next(&mut timeline)];
+        // SAFETY: the queue is locked for us; callers keep commands and semaphore alive; the chain lives until the call returns.
+        unsafe { self.device.queue_submit(*queue, &submit, vk::Fence::null()) }
+            .map_err(Error::vulkan("vkQueueSubmit", name))?;
+        self.last_submitted.store(value, Ordering::Release);
+        Ok(Ticket(value))
+    }
+
+    /// Submits the signal of a binary semaphore that outlives it.
+    #[cfg(unix)]
+    pub(super) fn submit_signal(&self, semaphore: vk::Semaphore, name: &str) -> Result<Ticket> {
+        // SAFETY: the owner of the semaphore waits in its drop for this submit.
+        unsafe { self.submit(&Work { signalled: Some(semaphore), ..Work::default() }, name) }
+    }
+}
+
 impl Commands {
     /// Submits the commands to the device.
     ///
     /// # Errors
     /// [`Error::DeviceLost`], [`Error::OutOfMemory`] or [`Error::Vulkan`].
     pub fn submit(&self) -> Result<Ticket> {
-        let shared = &self.gpu;
-        let queue = shared.locked_queue();
-        let value = shared.last_submitted.load(Ordering::Acquire) + 1;
-        let (values, semaphores, buffers) = ([value], [shared.timeline], [self.raw]);
-        let mut timeline = vk::TimelineSemaphoreSubmitInfo::default().signal_semaphore_values(&values);
-        let submit = [vk::SubmitInfo::default()
-            .command_buffers(&buffers)
-            .signal_semaphores(&semaphores)
-            .push_next(&mut timeline)];
-        // SAFETY: the queue is locked for us; the commands were ended, allow simultaneous use, and wait in their drop for
-        // this submit; the chain lives until the call returns.
-        unsafe { shared.device.queue_submit(*queue, &submit, vk::Fence::null()) }
-            .map_err(Error::vulkan("vkQueueSubmit", &self.name))?;
-        shared.last_submitted.store(value, Ordering::Release);
-        self.last_submit.store(value, Ordering::Release);
-        Ok(Ticket(value))
+        let work = Work { commands: Some(self.raw), ..Work::default() };
+        // SAFETY: the commands were ended, allow simultaneous use, and wait in their drop for this submit.
+        let ticket = unsafe { self.gpu.submit(&work, &self.name) }?;
+        self.last_submit.store(ticket.0, Ordering::Release);
+        Ok(ticket)
     }
 
     /// Returns the number of barriers at which commands wait for earlier ones, including the barrier at the start.

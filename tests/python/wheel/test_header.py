@@ -9,7 +9,7 @@ import pytest
 from nertca_vk import _library, errors, results
 
 PACKAGE = Path(nertca_vk.__file__).parent
-# Made by the caller from what it has: devices of its own, buffers on the device.
+# Made by the caller from what it has: devices of its own, buffers and semaphores of the device.
 LEFT_OUT = {
     "nertca_context_adopt",
     "nertca_reconstruction_render_buffer",
@@ -17,6 +17,10 @@ LEFT_OUT = {
     "nertca_buffer_create",
     "nertca_buffer_export_fd",
     "nertca_buffer_destroy",
+    "nertca_semaphore_create",
+    "nertca_semaphore_export_fd",
+    "nertca_semaphore_signal",
+    "nertca_semaphore_destroy",
     "nertca_status_text",
 }
 
