@@ -246,6 +246,7 @@ pub mod trees {
     pub mod files;
     mod follow;
     mod graph;
+    mod information;
     pub mod lesions;
     #[cfg(feature = "dicom")]
     pub mod measurements;

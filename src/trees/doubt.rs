@@ -10,6 +10,7 @@ use crate::evidence::series::Series;
 use crate::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
 use crate::raster::percentile;
 use crate::scan::dataset::Dataset;
+use crate::trees::information::Information;
 use crate::trees::refine::tangents;
 use crate::trees::ridges::ridge_offset;
 use crate::trees::sight::TreeInView;
@@ -27,9 +28,6 @@ const LEFT_EXPONENT: f64 = 0.5;
 const LEFT_OF_THREE_MM: f64 = 0.15;
 /// Maximum error that calibration leaves of a disagreement of 1 mm, mm: two views.
 const LEFT_MAX_MM: f64 = 0.5;
-/// Least information of a direction across a vessel, in units of a view that is perpendicular to it. Rays that nearly coincide tell no
-/// depth, and the smoothness of the vessel limits the error then.
-const MIN_INFORMATION: f64 = 0.01;
 /// Error of the motion along a vessel: its share of the displacement since the reference phase, and its maximum, mm.
 const ALONG_SHARE: f64 = 0.5;
 const ALONG_MAX_MM: f64 = 1.0;
@@ -175,7 +173,8 @@ impl Scale {
         moved_mm: Option<f64>,
         agreement: Option<f64>,
     ) -> Doubt {
-        let (direction, dilution) = least_certain(rays, tangent);
+        let information = rays.fold(Information::none(tangent), |sum, ray| sum.with(ray));
+        let (direction, dilution) = information.least_certain();
         let seen_mm = self.image_mm * dilution;
         let across_mm = match (self.n_views, agreement) {
             (..=2, None) => seen_mm.hypot(SINGLE_FALSE_CROSSINGS_MM),
@@ -195,23 +194,6 @@ impl Scale {
     }
 }
 
-/// Returns the least certain direction across a vessel, and the error of a point along it in units of the error of one image: each ray
-/// informs about the direction that is perpendicular to itself and to the vessel.
-fn least_certain(rays: impl Iterator<Item = DVec3>, tangent: DVec3) -> (DVec3, f64) {
-    let (u, v) = tangent.any_orthonormal_pair();
-    let (mut uu, mut uv, mut vv) = (0.0, 0.0, 0.0);
-    for ray in rays {
-        let seen = ray.cross(tangent);
-        let (a, b) = (seen.dot(u), seen.dot(v));
-        (uu, uv, vv) = (uu + a * a, uv + a * b, vv + b * b);
-    }
-    let (mean, spread) = (0.5 * (uu + vv), (0.5 * (uu - vv)).hypot(uv));
-    let least = (mean - spread).max(MIN_INFORMATION);
-    // Angle of the largest information; the least one is perpendicular.
-    let most = 0.5 * (2.0 * uv).atan2(uu - vv);
-    (v * most.cos() - u * most.sin(), least.sqrt().recip())
-}
-
 /// Returns the value of a table (arguments in ascending order), interpolated linearly; beyond the ends, the value at the end.
 fn between(table: &[(f64, f64)], at: f64) -> f64 {
     let after = table.iter().position(|(x, _)| *x >= at).unwrap_or(table.len() - 1);
@@ -225,26 +207,6 @@ mod tests {
 
     fn along(degrees: f64) -> DVec3 {
         DVec3::new(degrees.to_radians().cos(), degrees.to_radians().sin(), 0.0)
-    }
-
-    #[test]
-    fn the_least_certain_direction_is_the_depth_of_rays_that_nearly_coincide() {
-        // Two rays 20 degrees apart about the x axis, and a vessel along z: each shows its perpendicular in the plane.
-        let (direction, dilution) = least_certain([along(-10.0), along(10.0)].into_iter(), DVec3::Z);
-        assert!(direction.dot(DVec3::X).abs() > 0.999, "{direction}");
-        let expected = (2.0 * 10f64.to_radians().sin().powi(2)).sqrt().recip();
-        assert!((dilution / expected - 1.0).abs() < 1e-9, "{dilution} instead of {expected}");
-        // Rays at right angles are equally good in all directions.
-        let (_, dilution) = least_certain([along(0.0), along(90.0)].into_iter(), DVec3::Z);
-        assert!((dilution - 1.0).abs() < 1e-9);
-        // A vessel along the plane of both rays: its place in the plane is not shown.
-        let (direction, dilution) = least_certain([along(0.0), along(90.0)].into_iter(), DVec3::X);
-        assert!(direction.dot(DVec3::Y).abs() > 0.999 && dilution > 0.99, "{direction} {dilution}");
-        let (_, limited) = least_certain(std::iter::empty(), DVec3::Z);
-        assert!(
-            (limited - MIN_INFORMATION.sqrt().recip()).abs() < 1e-9,
-            "a point that no view shows has a finite interval"
-        );
     }
 
     #[test]

@@ -3,8 +3,11 @@
 
 use crate::error::{Error, Result};
 use crate::geometry::{CArm, Geometry, ViewRays, rotation, world_from_lps_mm};
+use crate::scan::gating::SYSTOLE_SHARE;
+use crate::trees::information::Information;
+use crate::trees::refine::tangents;
 use crate::trees::sight::{Sight, TreeInView};
-use crate::trees::tree::{PhaseTree, TreeView};
+use crate::trees::tree::{Branch, PhaseTree, TreeView};
 use glam::DVec3;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -25,6 +28,19 @@ pub struct ArmLimits {
     pub step_deg: f64,
 }
 
+impl Default for ArmLimits {
+    /// Returns the positions that most C-arms reach.
+    fn default() -> Self {
+        ArmLimits { primary_deg: [-90.0, 90.0], secondary_deg: [-40.0, 40.0], step_deg: 5.0 }
+    }
+}
+
+/// Returns the phases that a view is judged by: the ends of diastole and systole, between which vessels move most.
+pub fn decisive_phases(n_phases: u32) -> Vec<u32> {
+    let systole = (SYSTOLE_SHARE * f64::from(n_phases)).round() as u32 % n_phases.max(1);
+    if systole == 0 { vec![0] } else { vec![0, systole] }
+}
+
 /// A further view, and how it would show the vessels.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Candidate {
@@ -41,6 +57,9 @@ pub struct Candidate {
     pub foreshortening: f64,
     /// Share of the length that lies outside the image, 0 to 1.
     pub outside: f64,
+    /// Share of the doubt about places across vessels that the view would remove: the mean over the length of how far the largest
+    /// error at a place would fall, 0 to 1. None where no training view is known.
+    pub doubt_removed: Option<f64>,
     /// Angle to the nearest training view, or to the view opposite to it, degrees; none where no training view is known.
     pub nearest_view_deg: Option<f64>,
     /// Measure of what the view lacks: the lowest is the best.
@@ -76,8 +95,39 @@ pub fn candidates(subject: &Subject<'_>, limits: &ArmLimits) -> Result<Vec<Candi
         let problem = format!("is not in the tree, which has branches 0 to {}", tree.branches.len().saturating_sub(1));
         return Err(Error::config("branch", branch, problem));
     }
+    let known: Vec<Known> = subject.phases.iter().map(|tree| Known::of(tree, subject)).collect();
     let positions: Vec<(f64, f64)> = secondary.iter().flat_map(|s| primary.iter().map(|p| (*p, *s))).collect();
-    positions.par_iter().map(|(primary, secondary)| subject.candidate(*primary, *secondary)).collect()
+    positions.par_iter().map(|(primary, secondary)| subject.candidate(&known, *primary, *secondary)).collect()
+}
+
+/// What the training views tell about the points of a tree.
+struct Known {
+    /// Information about each point, `[branch][point]`.
+    information: Vec<Vec<Information>>,
+    /// Error at each point along its least certain direction, in units of the error of one image.
+    errors: Vec<Vec<f64>>,
+}
+
+impl Known {
+    fn of(tree: &PhaseTree, subject: &Subject<'_>) -> Known {
+        let shown: Vec<TreeInView> =
+            subject.views.iter().map(|view| TreeInView::new(tree, &view.rays, subject.resolution_mm)).collect();
+        let of_point = |branch: usize, point: usize, tangent: DVec3| {
+            shown.iter().fold(Information::none(tangent), |sum, view| sum.with(view.ray(branch, point)))
+        };
+        let of_branch = |(index, branch): (usize, &Branch)| -> Vec<Information> {
+            let tangents = tangents(&branch.points_mm).into_iter().enumerate();
+            tangents.map(|(point, tangent)| of_point(index, point, tangent)).collect()
+        };
+        let information: Vec<Vec<Information>> = tree.branches.iter().enumerate().map(of_branch).collect();
+        let error = |of: &Information| of.least_certain().1;
+        Known { errors: information.iter().map(|branch| branch.iter().map(error).collect()).collect(), information }
+    }
+
+    /// Returns the share of the error at a point that a further ray removes.
+    fn removed(&self, branch: usize, point: usize, ray: DVec3) -> f64 {
+        1.0 - self.information[branch][point].with(ray).least_certain().1 / self.errors[branch][point]
+    }
 }
 
 /// Returns the best candidates, at most `count`, at least `apart_deg` from one another.
@@ -131,28 +181,29 @@ struct Sums {
     outside: f64,
     doubtful: f64,
     doubtful_covered: f64,
+    removed: f64,
 }
 
 impl Subject<'_> {
-    fn candidate(&self, primary_deg: f64, secondary_deg: f64) -> Result<Candidate> {
+    fn candidate(&self, known: &[Known], primary_deg: f64, secondary_deg: f64) -> Result<Candidate> {
         let c_arm = CArm { primary_deg, secondary_deg, ..self.c_arm.clone() };
         let [width, height] = self.image_size;
         let rays = Geometry::CArm(c_arm).rays(width, height).map_err(|(field, problem)| {
             Error::config("c_arm", field, format!("{problem}: no further view can be planned with it"))
         })?;
         let mut sums = Sums::default();
-        self.phases.iter().for_each(|tree| self.add(tree, &rays, &mut sums));
+        self.phases.iter().zip(known).for_each(|(tree, known)| self.add(tree, known, &rays, &mut sums));
         let axis = axis(primary_deg, secondary_deg);
         let to_view = |view: &TreeView| angle_deg(axis, view.rays.axis().normalize_or(DVec3::X));
         let nearest_view_deg = self.views.iter().map(to_view).min_by(f64::total_cmp);
         let share = |part: f64| if sums.length > 0.0 { part / sums.length } else { 0.0 };
         let doubtful_overlap = (sums.doubtful > 0.0).then(|| sums.doubtful_covered / sums.doubtful);
         let (overlap, foreshortening, outside) = (share(sums.covered), share(sums.lost), share(sums.outside));
-        let known = nearest_view_deg.map_or(0.0, |deg| (1.0 - deg / NEW_DEG).max(0.0));
+        let is_near = nearest_view_deg.map_or(0.0, |deg| (1.0 - deg / NEW_DEG).max(0.0));
         let cost = match self.branch {
             // A branch is looked at: it is to be seen whole, from wherever that may be.
             Some(_) => overlap + foreshortening + outside,
-            None => overlap + doubtful_overlap.unwrap_or(overlap) + SHORTENED * foreshortening + outside + known,
+            None => overlap + doubtful_overlap.unwrap_or(overlap) + SHORTENED * foreshortening + outside + is_near,
         };
         Ok(Candidate {
             primary_deg,
@@ -161,12 +212,13 @@ impl Subject<'_> {
             doubtful_overlap,
             foreshortening,
             outside,
+            doubt_removed: (!self.views.is_empty()).then(|| share(sums.removed)),
             nearest_view_deg,
             cost,
         })
     }
 
-    fn add(&self, tree: &PhaseTree, rays: &ViewRays, sums: &mut Sums) {
+    fn add(&self, tree: &PhaseTree, known: &Known, rays: &ViewRays, sums: &mut Sums) {
         let shown = TreeInView::new(tree, rays, self.resolution_mm);
         let [width, height] = self.image_size.map(|n| n as f64 - 0.5);
         let counts = |index: usize| self.branch.is_none_or(|branch| branch == index);
@@ -183,6 +235,10 @@ impl Subject<'_> {
                 sums.covered += overlap * step_mm;
                 sums.lost += foreshortening * step_mm;
                 sums.outside += if inside { 0.0 } else { step_mm };
+                // A place that another vessel covers, or that lies outside, is not measured.
+                let is_measured = inside && !shown.is_covered(index, point);
+                let removed = if is_measured { known.removed(index, point, shown.ray(index, point)) } else { 0.0 };
+                sums.removed += removed * step_mm;
                 sums.doubtful += doubt;
                 sums.doubtful_covered += overlap * doubt;
             }
@@ -193,8 +249,6 @@ impl Subject<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trees::tree::Branch;
-
     const LIMITS: ArmLimits = ArmLimits { primary_deg: [-90.0, 90.0], secondary_deg: [-40.0, 40.0], step_deg: 10.0 };
 
     fn c_arm() -> CArm {
@@ -231,6 +285,22 @@ mod tests {
         let phases = std::slice::from_ref(tree);
         let subject = Subject { phases, resolution_mm: 1.0, views, branch, c_arm: &c_arm, image_size: [100; 2] };
         candidates(&subject, &LIMITS).unwrap()
+    }
+
+    #[test]
+    fn a_view_across_the_known_ones_removes_the_doubt_about_depth() {
+        let tree = PhaseTree { phase: 0, branches: vec![line([0.0, 0.0, -15.0], [0.0, 0.0, 15.0], 1.0)] };
+        let views = [view(-10.0), view(10.0)];
+        let all = found(&tree, &views, None);
+        let removed = |primary: f64| {
+            all.iter().find(|c| (c.primary_deg, c.secondary_deg) == (primary, 0.0)).unwrap().doubt_removed.unwrap()
+        };
+        // The views are 20 degrees apart: depth is known 1 / sqrt(2 sin(10)^2) = 4.07 times worse than a place in an image, and the side
+        // 1 / sqrt(2 cos(10)^2) = 0.72 times, which is the largest error once a view from the side shows the depth.
+        let expected = 1.0 - 1.0 / (1.0 + 2.0 * 10f64.to_radians().sin().powi(2)).sqrt() / 4.072;
+        assert!((removed(90.0) - expected).abs() < 0.02, "{} instead of {expected}", removed(90.0));
+        assert!(removed(0.0) < 0.02, "between the views it tells nothing new: {}", removed(0.0));
+        assert!(found(&tree, &[], None)[0].doubt_removed.is_none());
     }
 
     #[test]

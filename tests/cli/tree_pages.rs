@@ -124,6 +124,13 @@ fn the_viewer_draws_the_tree_where_the_engine_sees_it() {
     let (lines, all) = (mean(points.iter().map(on).collect()), mean(picture.iter().map(|v| f64::from(*v)).collect()));
     assert!(lines < 150.0 && all > 235.0, "grey is {lines:.0} under the lines and {all:.0} everywhere");
     assert_eq!(server.tree()["tree"], tree, "the page has what the file has");
+    for branch in [&[][..], &["--branch", "0"]] {
+        let (printed, _) = ok(&[&["next", text(run), "--json"], branch].concat());
+        let query = if branch.is_empty() { "/next?" } else { "/next?branch=0&" };
+        let answer: Value = serde_json::from_slice(&server.ask(query)).unwrap();
+        assert_eq!(answer, serde_json::from_str::<Value>(&printed).unwrap(), "the page has what the command prints");
+        assert!(answer["suggested"][0]["doubt_removed"].as_f64().unwrap() > 0.0, "{}", answer["suggested"][0]);
+    }
 }
 
 #[test]

@@ -57,6 +57,31 @@ with Page(expected["url"]) as page:
         assert chosen == branch, (chosen, branch)
     page.picture(sys.argv[2])
 
+    # The next view for the clicked branch, then for all vessels.
+    last = len(lines(page)) - 1
+    for whom in (f"For branch {last}:", "For all vessels:"):
+        page.evaluate("document.getElementById('next').click()")
+        page.wait("document.querySelectorAll('#suggested button').length > 0")
+        assert page.evaluate("document.getElementById('suggested').textContent").startswith(whom)
+        best = page.evaluate("JSON.stringify(plan.suggested[0])")
+        best = json.loads(best)
+        texts = page.evaluate("[...document.querySelectorAll('#suggested button')].map(b => b.textContent)")
+        print(whom, texts)
+        assert 1 <= len(texts) <= 3 and f"doubt removed {round(100 * best['doubt_removed'])} %" in texts[0], texts
+        drawn = page.evaluate("+document.body.dataset.drawn")
+        page.evaluate("document.querySelector('#suggested button').click()")
+        page.wait(f"document.body.dataset.drawn > {drawn} && !busy")
+        assert page.evaluate("[state.primary, state.secondary]") == [best["primary_deg"], best["secondary_deg"]]
+        # A click on the map's corner at the lower left turns the C-arm to the lowest angles.
+        corner = page.evaluate("(() => { const b = document.getElementById('map').getBoundingClientRect();"
+                               " return [b.left + 1, b.bottom - 1]; })()")
+        page.evaluate(f"document.getElementById('map').dispatchEvent(new MouseEvent('click', "
+                      f"{{clientX: {corner[0]}, clientY: {corner[1]}}}))")
+        assert page.evaluate("[state.primary, state.secondary]") == [-90, -40]
+        page.evaluate("place = null")
+    page.wait("!busy")
+    page.picture(sys.argv[2].replace(".png", "-next.png"))
+
     page.evaluate("document.getElementById('tree-shown').click()")
     assert lines(page) == [] and page.evaluate("document.getElementById('tree-text').textContent") == ""
 

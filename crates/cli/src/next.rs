@@ -9,12 +9,14 @@ use nertca_vk::checkpoint::newest_model;
 use nertca_vk::error::Result;
 use nertca_vk::files::pretty_json;
 use nertca_vk::formats::png;
-use nertca_vk::scan::gating::SYSTOLE_SHARE;
-use nertca_vk::trees::next_view::{ArmLimits, Candidate, Subject, best, candidates};
-use nertca_vk::trees::tree::TreeView;
+use nertca_vk::geometry::CArm;
+use nertca_vk::trees::next_view::{ArmLimits, Candidate, Subject, best, candidates, decisive_phases};
+use nertca_vk::trees::tree::{BeatTree, PhaseTree, TreeView};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
+/// Number of suggestions where nobody asks for another.
+pub const SUGGESTIONS: usize = 3;
 /// Angle between suggestions, degrees.
 const APART_DEG: f64 = 20.0;
 
@@ -50,7 +52,7 @@ pub struct NextArgs {
     #[arg(long, value_name = "DEG", default_value_t = 5.0)]
     pub step: f64,
     /// Number of suggestions, at least 20 degrees apart.
-    #[arg(long, value_name = "N", default_value_t = 3)]
+    #[arg(long, value_name = "N", default_value_t = SUGGESTIONS)]
     pub count: usize,
     /// Print JSON with all positions instead of a table.
     #[arg(long)]
@@ -60,14 +62,42 @@ pub struct NextArgs {
     pub out: Option<PathBuf>,
 }
 
-/// JSON of the command.
+/// Positions of the C-arm for the next view, as the command prints them in JSON.
 #[derive(Serialize)]
-struct Answer<'a> {
+pub struct Plan {
     format: &'static str,
     version: u32,
     branch: Option<usize>,
-    suggested: &'a [Candidate],
-    positions: &'a [Candidate],
+    suggested: Vec<Candidate>,
+    positions: Vec<Candidate>,
+}
+
+impl Plan {
+    /// Plans the next view of a tree, with a C-arm whose images have so many columns and rows: all vessels count, or one branch.
+    ///
+    /// # Errors
+    /// Errors of [`candidates`].
+    pub fn new(
+        beat: &BeatTree,
+        (c_arm, image_size): (&CArm, [usize; 2]),
+        branch: Option<usize>,
+        limits: &ArmLimits,
+        count: usize,
+    ) -> Result<Plan> {
+        let is_followed = beat.reference_phase.is_some();
+        let decisive = decisive_phases(beat.phases.len() as u32);
+        let counts = |(index, tree): (usize, &PhaseTree)| {
+            // The command finds the decisive phases alone.
+            let counts = index == 0 || is_followed && (beat.phases.len() <= 2 || decisive.contains(&tree.phase));
+            counts.then(|| tree.clone())
+        };
+        let phases: Vec<PhaseTree> = beat.phases.iter().enumerate().filter_map(counts).collect();
+        let (resolution_mm, views) = (beat.resolution_mm, beat.views.as_slice());
+        let subject = Subject { phases: &phases, resolution_mm, views, branch, c_arm, image_size };
+        let positions = candidates(&subject, limits)?;
+        let suggested = best(&positions, count, APART_DEG);
+        Ok(Plan { format: "nertca-next-view", version: 1, branch, suggested, positions })
+    }
 }
 
 /// Suggests the view to take next.
@@ -79,31 +109,16 @@ pub fn run(global: &GlobalOptions, args: &NextArgs) -> Result<()> {
     };
     let model = newest_model(&args.run)?;
     let gpu = global.open_device()?;
-    let n_phases = model.shown_phases();
-    // The ends of diastole and systole, between which vessels move most.
-    let systole = (SYSTOLE_SHARE * f64::from(n_phases)).round() as u32 % n_phases.max(1);
-    let phases = if systole == 0 { vec![0] } else { vec![0, systole] };
-    let beat = found_in_phases(global, &gpu, &model, phases)?;
-    let views = training_views(&args.run, "the training views do not count");
-    let subject = Subject {
-        phases: if beat.reference_phase.is_some() { &beat.phases } else { &beat.phases[..1] },
-        resolution_mm: beat.resolution_mm,
-        views: &views,
-        branch: args.branch,
-        c_arm: &model.c_arm,
-        image_size: model.image_size,
-    };
-    let positions = candidates(&subject, &limits)?;
-    let suggested = best(&positions, args.count, APART_DEG);
+    let mut beat = found_in_phases(global, &gpu, &model, decisive_phases(model.shown_phases()))?;
+    beat.views = training_views(&args.run, "the training views do not count");
+    let plan = Plan::new(&beat, (&model.c_arm, model.image_size), args.branch, &limits, args.count)?;
     if let Some(file) = &args.out {
-        write_map(&positions, &suggested, &views, file)?;
+        write_map(&plan, &beat.views, file)?;
     }
     if args.json {
-        let (format, version) = ("nertca-next-view", 1);
-        let answer = Answer { format, version, branch: args.branch, suggested: &suggested, positions: &positions };
-        out!("{}", pretty_json(&answer)?);
+        out!("{}", pretty_json(&plan)?);
     } else {
-        suggested.iter().for_each(|candidate| out!("{}", in_words(candidate)));
+        plan.suggested.iter().for_each(|candidate| out!("{}", in_words(candidate)));
     }
     global.close_device(&gpu)
 }
@@ -130,8 +145,11 @@ fn in_words(candidate: &Candidate) -> String {
     let nearest = candidate
         .nearest_view_deg
         .map_or(String::new(), |deg| format!("; {deg:.0} degrees from the nearest training view"));
+    let removed = candidate
+        .doubt_removed
+        .map_or(String::new(), |share| format!("; the view removes {} of the doubt about places", percent(share)));
     format!(
-        "{}: other vessels touch {} of the length{doubtful}; {} are lost to foreshortening, {} lie outside the image{nearest}",
+        "{}: other vessels touch {} of the length{doubtful}; {} are lost to foreshortening, {} lie outside the image{removed}{nearest}",
         angles(candidate.primary_deg, candidate.secondary_deg),
         percent(candidate.overlap),
         percent(candidate.foreshortening),
@@ -151,8 +169,8 @@ const INK: Rgb<u8> = Rgb([20, 20, 24]);
 const RED: Rgb<u8> = Rgb([214, 30, 40]);
 
 /// Writes the map of the positions, RAO at the left and cranial at the top.
-fn write_map(positions: &[Candidate], suggested: &[Candidate], views: &[TreeView], file: &Path) -> Result<()> {
-    Ok(png::write(file, &DynamicImage::ImageRgb8(map(positions, suggested, views)))?)
+fn write_map(plan: &Plan, views: &[TreeView], file: &Path) -> Result<()> {
+    Ok(png::write(file, &DynamicImage::ImageRgb8(map(&plan.positions, &plan.suggested, views)))?)
 }
 
 fn map(positions: &[Candidate], suggested: &[Candidate], views: &[TreeView]) -> RgbImage {
@@ -221,6 +239,7 @@ mod tests {
             doubtful_overlap: None,
             foreshortening: 0.1,
             outside: 0.0,
+            doubt_removed: Some(0.4),
             nearest_view_deg: Some(31.0),
             cost,
         }
@@ -247,5 +266,6 @@ mod tests {
     fn a_position_is_told_in_degrees_of_the_c_arm() {
         let told = in_words(&candidate(-20.0, 15.0, 0.0));
         assert!(told.starts_with("RAO 20, CRA 15: other vessels touch 25 %"), "{told}");
+        assert!(told.contains("removes 40 % of the doubt"), "{told}");
     }
 }

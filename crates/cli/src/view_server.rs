@@ -243,6 +243,37 @@ async fn tree(State(viewer): State<Arc<Viewer>>) -> Response {
     json_answer(answer)
 }
 
+/// Query for the next view.
+#[derive(Debug, Deserialize)]
+struct NextViewQuery {
+    /// Branch that is looked at; all of them by default.
+    branch: Option<usize>,
+}
+
+/// Returns the positions of the C-arm for the next view, in the format that `next --json` prints.
+async fn next_view(State(viewer): State<Arc<Viewer>>, Query(query): Query<NextViewQuery>) -> Response {
+    let planned = tokio::task::spawn_blocking(move || {
+        let taken = viewer.shown.taken()?;
+        let plan = viewer.tree.next_view((&taken.c_arm, taken.image_size), query.branch)?;
+        serde_json::to_string(&plan).map_err(|e| Error::Internal(e.to_string()))
+    });
+    match planned.await {
+        Ok(Ok(plan)) => json_answer(plan),
+        Ok(Err(error)) => refusal(&error),
+        Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")).into_response(),
+    }
+}
+
+/// Returns the answer to a request that failed.
+fn refusal(error: &Error) -> Response {
+    let code = match error {
+        Error::Config { .. } => StatusCode::BAD_REQUEST,
+        Error::NotReady(_) => StatusCode::SERVICE_UNAVAILABLE,
+        _ => StatusCode::INTERNAL_SERVER_ERROR,
+    };
+    (code, format!("{error}\n")).into_response()
+}
+
 /// Draws a picture when its turn comes. When a client leaves, the server drops this future, so a picture that nobody waits for any
 /// more is not begun.
 async fn frame(State(viewer): State<Arc<Viewer>>, Query(query): Query<PictureQuery>) -> Response {
@@ -253,9 +284,7 @@ async fn frame(State(viewer): State<Arc<Viewer>>, Query(query): Query<PictureQue
     });
     match drawn.await {
         Ok(Ok(png)) => ([(header::CONTENT_TYPE, "image/png")], png).into_response(),
-        Ok(Err(error @ Error::Config { .. })) => (StatusCode::BAD_REQUEST, format!("{error}\n")).into_response(),
-        Ok(Err(error @ Error::NotReady(_))) => (StatusCode::SERVICE_UNAVAILABLE, format!("{error}\n")).into_response(),
-        Ok(Err(error)) => (StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")).into_response(),
+        Ok(Err(error)) => refusal(&error),
         Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")).into_response(),
     }
 }
@@ -309,6 +338,7 @@ impl Server {
             .route("/info", get(info))
             .route("/frame", get(frame))
             .route("/tree", get(tree))
+            .route("/next", get(next_view))
             .layer(middleware::from_fn_with_state(viewer.clone(), guard))
             .with_state(viewer.clone());
         let ended = async move {

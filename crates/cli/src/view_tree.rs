@@ -1,12 +1,15 @@
 //! The viewer's vessel tree: found once, when the page first requests it, while pictures are still drawn.
 
+use super::next::{Plan, SUGGESTIONS};
 use nertca_vk::error::{Error, Result};
+use nertca_vk::geometry::CArm;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::model::Model;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::to_json;
+use nertca_vk::trees::next_view::ArmLimits;
 use nertca_vk::trees::tree::BeatTree;
 use serde_json::json;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -18,8 +21,15 @@ enum TreeState {
     Working { done: u64, of: u64 },
     /// Reason why there is no tree.
     Failed(String),
-    /// Tree of all phases, in the format that `tree -o FILE.json` writes.
-    Ready(String),
+    /// Tree of all phases.
+    Ready(Arc<Found>),
+}
+
+/// A tree that was found.
+struct Found {
+    beat: BeatTree,
+    /// The tree in the format that `tree -o FILE.json` writes.
+    json: String,
 }
 
 impl TreeState {
@@ -28,7 +38,7 @@ impl TreeState {
         match self {
             TreeState::Working { done, of } => json!({ "state": "working", "done": done, "of": of }).to_string(),
             TreeState::Failed(problem) => json!({ "state": "failed", "problem": problem }).to_string(),
-            TreeState::Ready(tree) => format!(r#"{{"state":"ready","tree":{tree}}}"#),
+            TreeState::Ready(found) => format!(r#"{{"state":"ready","tree":{}}}"#, found.json),
         }
     }
 }
@@ -75,10 +85,22 @@ impl TreeWork {
     /// Finds the tree of a model, if the model exists, and completes it by `compare`, which knows the images. Takes seconds.
     pub fn find(&self, generation: u64, model: Result<Model>, compare: impl FnOnce(&mut BeatTree)) {
         let found = match model.and_then(|model| self.tree(generation, &model, compare)) {
-            Ok(json) => TreeState::Ready(json),
+            Ok(found) => TreeState::Ready(Arc::new(found)),
             Err(error) => TreeState::Failed(error.to_string()),
         };
         self.tell(generation, found);
+    }
+
+    /// Plans the next view of the tree, with a C-arm whose images have so many columns and rows.
+    ///
+    /// # Errors
+    /// [`Error::NotReady`] before the tree was found; [`Error::Config`] for a branch that the tree does not have.
+    pub fn next_view(&self, arm: (&CArm, [usize; 2]), branch: Option<usize>) -> Result<Plan> {
+        let found = match &self.current().state {
+            Some(TreeState::Ready(found)) => found.clone(),
+            _ => return Err(Error::NotReady("the vessels have not been found yet".into())),
+        };
+        Plan::new(&found.beat, arm, branch, &ArmLimits::default(), SUGGESTIONS)
     }
 
     /// Stores the state of a tree's search; returns whether the tree is still wanted.
@@ -107,7 +129,7 @@ impl TreeWork {
         self.stop.store(true, Ordering::Relaxed);
     }
 
-    fn tree(&self, generation: u64, model: &Model, compare: impl FnOnce(&mut BeatTree)) -> Result<String> {
+    fn tree(&self, generation: u64, model: &Model, compare: impl FnOnce(&mut BeatTree)) -> Result<Found> {
         // The search has its own renderer, because the viewer's renderer goes on drawing pictures, which pass between the slices of
         // the search.
         let (looks, stop) = (self.gpu.looks().clone(), self.stop.clone());
@@ -123,6 +145,6 @@ impl TreeWork {
             if wanted && !self.stop.load(Ordering::Relaxed) { Ok(()) } else { Err(Error::Interrupted) }
         })?;
         compare(&mut beat);
-        to_json(&beat)
+        Ok(Found { json: to_json(&beat)?, beat })
     }
 }
