@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
 use crate::program::program;
+use crate::tree_pages::{Server, python_test};
 use nertca_vk::capi::context::*;
 use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::{NERTCA_ERROR_ARGUMENT, NERTCA_ERROR_NOT_READY, NERTCA_OK};
@@ -109,6 +110,17 @@ fn expect_the_same_in_c(run: &Path, tree: &Value) {
     ok(unsafe { nertca_context_destroy(context) });
 }
 
+/// The viewer marks the stenoses and tells their numbers, and a measurement report has them.
+fn expect_shown_and_reported(directory: &Path) {
+    let at = |name: &str| directory.join(name);
+    for name in ["all.json", "all.dcm"] {
+        ok(&["tree", text(&at("run")), "-o", text(&at(name))]);
+    }
+    python_test("check_measurements.py", &[&at("all.dcm"), &at("all.json")]);
+    let viewer = Server::of(&at("run"));
+    python_test("check_viewer_lesions.py", &[Path::new(&viewer.url), &at("all.json"), &at("viewer.png")]);
+}
+
 #[test]
 fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
     let directory = tempfile::tempdir().unwrap();
@@ -128,6 +140,7 @@ fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
     assert!(page.contains("class=\"strip\"") && page.contains("#d0342c"), "the report has the vessel straightened");
     expect_foreshortening(&tree, lesion);
     expect_the_same_in_c(&ill.join("run"), &tree);
+    expect_shown_and_reported(&ill);
 
     let (truth, tree, said) = lesions_of(&healthy, &[]);
     assert!(truth.get("lesions").is_none(), "a truth without lesions has no such field");

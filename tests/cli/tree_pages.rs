@@ -21,13 +21,14 @@ const SIDE: usize = 420;
 type Line = Vec<[f64; 3]>;
 
 /// The viewer's process, until it is dropped.
-struct Server {
+pub struct Server {
     process: Child,
-    url: String,
+    /// Address of the page.
+    pub url: String,
 }
 
 impl Server {
-    fn of(run: &Path) -> Server {
+    pub fn of(run: &Path) -> Server {
         let mut process =
             program().args(["view", text(run)]).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
         let mut url = String::new();
@@ -82,7 +83,7 @@ fn seen(rays: &ViewRays, line: &Line) -> Vec<(f64, f64)> {
     line.iter().map(|point| rays.project(world_from_lps_mm((*point).into())).unwrap()).collect()
 }
 
-fn python_test(script: &str, args: &[&Path]) {
+pub fn python_test(script: &str, args: &[&Path]) {
     let script = crate::root::root().join("tests/python").join(script);
     let outcome = python().arg(script).args(args).output().unwrap();
     print!("{}", String::from_utf8_lossy(&outcome.stdout));

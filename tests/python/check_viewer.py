@@ -57,6 +57,25 @@ with Page(expected["url"]) as page:
         assert chosen == branch, (chosen, branch)
     page.picture(sys.argv[2])
 
+    # Doubt: an interval for each point, and each step of a centreline in one of the colours.
+    def strokes(kind):
+        return page.evaluate(f"[...document.querySelectorAll('#tree .{kind}')].map(p => (p.getAttribute('d') || '').split('M').length - 1)")
+
+    assert strokes("interval") == [0] and sum(strokes("level")) == 0
+    page.evaluate("document.getElementById('doubt-shown').click()")
+    branches = tree[phase]["branches"]
+    assert strokes("interval") == [sum(len(b["points_mm"]) for b in branches)], strokes("interval")
+    bounds = [0.25, 0.5, 1, 2, 4, np.inf]
+    wanted = [0] * len(bounds)
+    for b in branches:
+        for doubt in (np.array(b["doubt_mm"][1:]) + b["doubt_mm"][:-1]) / 2:
+            wanted[np.searchsorted(bounds, doubt)] += 1
+    assert strokes("level") == wanted, (strokes("level"), wanted)
+    assert "to 0.25 mm" in page.evaluate("document.getElementById('doubt-legend').textContent")
+    page.picture(sys.argv[2].replace(".png", "-doubt.png"))
+    page.evaluate("document.getElementById('doubt-shown').click()")
+    assert strokes("interval") == [0] and sum(strokes("level")) == 0
+
     # The next view for the clicked branch, then for all vessels.
     last = len(lines(page)) - 1
     for whom in (f"For branch {last}:", "For all vessels:"):
@@ -67,7 +86,7 @@ with Page(expected["url"]) as page:
         best = json.loads(best)
         texts = page.evaluate("[...document.querySelectorAll('#suggested button')].map(b => b.textContent)")
         print(whom, texts)
-        assert 1 <= len(texts) <= 3 and f"doubt removed {round(100 * best['doubt_removed'])} %" in texts[0], texts
+        assert 1 <= len(texts) <= 3 and f"doubt removed {round(100 * best['doubt_removed'])}\u00a0%" in texts[0], texts
         drawn = page.evaluate("+document.body.dataset.drawn")
         page.evaluate("document.querySelector('#suggested button').click()")
         page.wait(f"document.body.dataset.drawn > {drawn} && !busy")

@@ -35,19 +35,23 @@
       image.setAttribute("href", frame.picture);
       caption.textContent = `${view.title}, phase ${frame.phase}`;
       const branches = trees.branchesAt(tree, frame.phase);
-      if ($("tree-lines").checked) overlay.draw(branches, frame.projection, placeAt(frame.phase));
-      else overlay.clear();
+      if ($("tree-lines").checked) {
+        overlay.draw(branches, frame.projection, placeAt(frame.phase));
+        overlay.drawLesions(trees.lesionsAt(tree, frame.phase), branches, frame.projection);
+      } else overlay.clear();
       overlay.drawDoubt($("tree-doubt")?.checked ? branches : [], frame.projection);
     }
+    if ($("tree-legend")) $("tree-legend").hidden = !$("tree-doubt").checked;
     const phase = place ? shown(place.view).phase : 0;
     const here = placeAt(phase);
-    $("tree-told").textContent = here ? `${trees.told(trees.branchesAt(tree, phase), here)} (phase ${phase}).` : "Click a line.";
+    $("tree-told").textContent = here ? `${trees.told(trees.branchesAt(tree, phase), here, trees.lesionsAt(tree, phase))} (phase ${phase}).` : "Click a line.";
     for (const row of document.querySelectorAll("tr[data-branch]")) {
       const of = placeAt(Number(row.dataset.phase));
       row.classList.toggle("chosen", of !== null && of.branch === Number(row.dataset.branch));
     }
   }
   for (const mark of document.querySelectorAll("[data-colour]")) mark.style.background = trees.colour(Number(mark.dataset.colour));
+  if ($("tree-legend")) trees.legend($("tree-legend"));
   $("tree-phase").max = phases - 1;
   for (const id of ["tree-phase", "tree-lines", "tree-doubt"]) $(id)?.addEventListener("input", draw);
   draw();

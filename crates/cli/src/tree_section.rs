@@ -23,6 +23,8 @@ const STYLE: &str = "
 #tree-views polyline{fill:none;stroke-width:2px;vector-effect:non-scaling-stroke;stroke-linejoin:round;cursor:pointer}
 #tree-views .chosen{stroke-width:5px}#tree-views .mark{fill:#fff;stroke:#000;vector-effect:non-scaling-stroke}
 #tree-views .interval{fill:none;stroke:#fff;stroke-opacity:.7;stroke-width:1px;pointer-events:none}
+#tree-views .lesion{fill:none;stroke:#ff0;stroke-width:2px;pointer-events:none}
+#tree-views .level{fill:none;stroke-width:3px;pointer-events:none}
 tr.chosen td{font-weight:600}td i{display:inline-block;width:.8rem;height:.8rem;margin-right:.4rem}";
 
 /// Contents of the section about a tree.
@@ -73,7 +75,7 @@ impl TreeSection {
                 input #tree-phase type="range" min="0" value="0" step="1";
                 " " label { input #tree-lines type="checkbox" checked; " centrelines" }
                 @if self.beat.phases.iter().flat_map(|tree| &tree.branches).all(|branch| !branch.doubt.is_empty()) {
-                    " " label { input #tree-doubt type="checkbox"; " intervals" }
+                    " " label { input #tree-doubt type="checkbox"; " doubt" } " " span #tree-legend hidden {}
                 }
             }
             p #tree-told role="status" {}

@@ -6,7 +6,10 @@ const trees = (() => {
   // Colours that can be distinguished on white, on grey and on black.
   const COLOURS = ["#e6194b", "#1f8fff", "#2ca02c", "#ff8c00", "#b14bff", "#00a5a5", "#e75cc4", "#9a7b00"];
   const SVG = "http://www.w3.org/2000/svg";
-  const MARK_PX = 5;
+  const MARK_PX = 5, LESION_PX = 9;
+  // Upper bounds of the levels of doubt, mm (the last level has none), and their colours, from certain to doubtful.
+  const DOUBT_MM = [0.25, 0.5, 1, 2, 4, Infinity];
+  const DOUBT_COLOURS = ["#0b7a3b", "#3fae49", "#b3b300", "#f08c00", "#e0481f", "#9c0026"];
   const mix = (a, b, share) => a + (b - a) * share;
   const colour = branch => COLOURS[branch % COLOURS.length];
 
@@ -60,12 +63,25 @@ const trees = (() => {
     };
   }
 
+  // Returns the stenoses at a phase; those of the nearest phase between two.
+  function lesionsAt(tree, phase) {
+    return tree.phases[Math.round(phase) % tree.phases.length].lesions;
+  }
+
+  // Returns the text about the stenoses of a branch.
+  function lesionsTold(branch, lesions) {
+    const along = ways(branch.points_mm);
+    return lesions.map(lesion => `; stenosis of ${lesion.stenosis_percent.toFixed(0)} %, ${along[lesion.point].toFixed(1)} mm from its start: `
+      + `${lesion.min_diameter_mm.toFixed(2)} mm instead of ${lesion.reference_diameter_mm.toFixed(2)} mm`).join("");
+  }
+
   // Returns the text about a clicked branch.
-  function told(branches, place) {
+  function told(branches, place, lesions) {
     const m = measure(branches[place.branch], place), mm = v => v.toFixed(2) + " mm";
     return `Branch ${place.branch}: ${m.length_mm.toFixed(1)} mm long; minimum diameter ${mm(m.least_mm)}, `
       + `mean ${mm(m.mean_mm)}, ${mm(m.here_mm)} at this point, ${m.along_mm.toFixed(1)} mm from its start`
-      + doubtTold(branches[place.branch], place);
+      + doubtTold(branches[place.branch], place)
+      + lesionsTold(branches[place.branch], lesions.filter(lesion => lesion.branch === place.branch));
   }
 
   // Returns the text about the doubt at a place; nothing where doubt is not stated.
@@ -84,9 +100,38 @@ const trees = (() => {
       this.intervals = svg.insertBefore(document.createElementNS(SVG, "path"), this.mark);
       this.intervals.setAttribute("class", "interval");
       this.intervals.setAttribute("vector-effect", "non-scaling-stroke");
+      this.lesions = this.svg.insertBefore(document.createElementNS(SVG, "path"), this.mark);
+      this.lesions.setAttribute("class", "lesion");
+      this.lesions.setAttribute("vector-effect", "non-scaling-stroke");
+      this.levels = DOUBT_COLOURS.map(colour => {
+        const level = this.svg.insertBefore(document.createElementNS(SVG, "path"), this.mark);
+        level.setAttribute("class", "level");
+        level.setAttribute("vector-effect", "non-scaling-stroke");
+        level.style.stroke = colour;
+        return level;
+      });
     }
-    // Draws the intervals of all points, each as a line along its least certain direction; none without branches.
+    // Draws a square around the narrowest place of each stenosis.
+    drawLesions(lesions, branches, projection) {
+      const half = branches.length ? LESION_PX / this.svg.getScreenCTM().a : 0;
+      const square = ({branch, point}) => {
+        const at = project(projection, branches[branch].points_mm[point]);
+        return at ? `M${(at[0] - half).toFixed(2)} ${(at[1] - half).toFixed(2)}h${2 * half}v${2 * half}h${-2 * half}z` : "";
+      };
+      this.lesions.setAttribute("d", branches.length ? lesions.map(square).join("") : "");
+    }
+    // Draws the intervals of all points, each as a line along its least certain direction, and the centrelines in the colours of the
+    // doubt about their points; nothing without branches.
     drawDoubt(branches, projection) {
+      const coloured = DOUBT_MM.map(() => "");
+      for (const {doubt_mm, points_mm} of branches.filter(branch => branch.doubt_mm)) {
+        points_mm.slice(1).forEach((point, i) => {
+          const ends = [points_mm[i], point].map(end => project(projection, end));
+          const level = DOUBT_MM.findIndex(bound => (doubt_mm[i] + doubt_mm[i + 1]) / 2 <= bound);
+          if (ends.every(Boolean)) coloured[level] += "M" + ends.map(p => p.map(v => v.toFixed(2)).join(" ")).join("L");
+        });
+      }
+      this.levels.forEach((level, i) => level.setAttribute("d", coloured[i]));
       const strokes = branches.filter(branch => branch.doubt_mm).flatMap(branch => branch.points_mm.map((point, i) => {
         const end = sign => point.map((v, axis) => v + sign * branch.doubt_mm[i] * branch.doubt_direction[i][axis]);
         const ends = [-1, 1].map(sign => project(projection, end(sign)));
@@ -94,7 +139,7 @@ const trees = (() => {
       }));
       this.intervals.setAttribute("d", strokes.join(""));
     }
-    clear() { this.draw([], null, null); }
+    clear() { this.draw([], null, null); this.drawLesions([], [], null); }
     draw(branches, projection, place) {
       this.branches = branches;
       this.seen = branches.map(branch => branch.points_mm.map(point => project(projection, point)));
@@ -102,7 +147,7 @@ const trees = (() => {
       while (this.lines.length < branches.length) {
         const line = document.createElementNS(SVG, "polyline");
         line.style.stroke = colour(this.lines.length);
-        this.lines.push(this.svg.insertBefore(line, this.mark));
+        this.lines.push(this.svg.insertBefore(line, this.intervals));
       }
       this.seen.forEach((points, b) => {
         this.lines[b].setAttribute("points", points.filter(Boolean).map(p => p.map(v => v.toFixed(3)).join()).join(" "));
@@ -130,5 +175,14 @@ const trees = (() => {
       return nearest;
     }
   }
-  return {Overlay, branchesAt, cArmProjection, colour, told};
+  // Fills an element with the meaning of the colours of doubt.
+  function legend(element) {
+    const texts = DOUBT_MM.map((bound, i) => Number.isFinite(bound) ? `to ${bound} mm` : `above ${DOUBT_MM[i - 1]} mm`);
+    element.replaceChildren("Known (68 %): ", ...texts.flatMap((text, i) => {
+      const mark = document.createElement("span");
+      mark.style.cssText = `display:inline-block;width:.8em;height:.8em;background:${DOUBT_COLOURS[i]}`;
+      return [mark, ` ${text}  `];
+    }));
+  }
+  return {Overlay, branchesAt, cArmProjection, colour, legend, lesionsAt, told};
 })();
