@@ -269,6 +269,7 @@ pub mod score {
     pub mod dice;
     pub mod distance;
     pub mod eval;
+    pub mod lesions;
     pub mod metrics;
     mod nearest;
     pub mod pictures;

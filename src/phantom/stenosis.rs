@@ -3,6 +3,7 @@
 use crate::error::{Error, Result};
 use crate::phantom::tree::Tree;
 use crate::scan::truth::TrueLesion;
+use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
 
 /// Minimum number of points of the centreline within a stenosis. Fewer do not show its shape.
@@ -11,7 +12,8 @@ const MIN_POINTS: usize = 5;
 const LARGEST_PERCENT: f64 = 95.0;
 
 /// A stenosis that a phantom is asked for.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Stenosis {
     /// Name of the branch, as the tree has it.
     pub branch: String,

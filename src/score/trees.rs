@@ -8,6 +8,7 @@ use crate::scan::gating::BeatTime;
 use crate::scan::truth::Truth;
 use crate::score::calibrated::{TrueFrames, shift_of, true_rays};
 use crate::score::dice::mean;
+use crate::score::lesions::LesionScores;
 use crate::score::nearest::{LinePlace, Lines};
 use crate::score::shapes::WITHIN_MM;
 use crate::trees::tree::{BeatTree, EXISTS_WITHIN_MM, PhaseTree};
@@ -78,6 +79,9 @@ pub struct TreeScores {
     pub mean_as_stated: Option<TreeAgreement>,
     /// One row per phase.
     pub phases: Vec<PhaseTreeScores>,
+    /// Scores of the stenoses; `None` where the true ones are not known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lesions: Option<LesionScores>,
 }
 
 /// Scores a tree. `truth` returns the true vessels at a moment of the beat, which goes from 0 to the dataset's number of
@@ -119,7 +123,7 @@ pub fn score(
         Ok(PhaseTreeScores { phase: tree.phase, scores })
     });
     let phases = phases.collect::<Result<Vec<PhaseTreeScores>>>()?;
-    Ok(TreeScores { within_mm: WITHIN_MM, mean: means(&phases), mean_as_stated: None, phases })
+    Ok(TreeScores { within_mm: WITHIN_MM, mean: means(&phases), mean_as_stated: None, phases, lesions: None })
 }
 
 fn means(phases: &[PhaseTreeScores]) -> TreeAgreement {

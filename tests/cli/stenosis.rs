@@ -33,7 +33,7 @@ fn read(path: &Path) -> Value {
 /// Trains on a phantom with further options; returns its truth, its tree, and the words of the tree command.
 fn lesions_of(directory: &Path, more: &[&str]) -> (Value, Value, String) {
     let at = |name: &str| directory.join(name);
-    let size = ["--size", "80", "--phases", "6", "--no-volumes"];
+    let size = ["--size", "80", "--phases", "6", "--volumes-every", "6"];
     ok(&[&["phantom", text(&at("data"))], &size[..], more].concat());
     ok(&["train", text(&at("data")), "-o", text(&at("run")), "--no-eval", "--stop-at", "130", "--tree"]);
     let said = ok(&["tree", text(&at("run")), "--phase", "0", "-o", text(&at("tree.json"))]);
@@ -110,6 +110,14 @@ fn expect_the_same_in_c(run: &Path, tree: &Value) {
     ok(unsafe { nertca_context_destroy(context) });
 }
 
+/// Scores of the stenoses of a run, from `eval`.
+fn lesion_scores(run: &Path) -> Value {
+    let out = program().args(["eval", text(run), "--tree", "--json"]).output().unwrap();
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let scores: Value = serde_json::from_slice(&out.stdout).unwrap();
+    scores["tree"]["lesions"].clone()
+}
+
 /// The viewer marks the stenoses and tells their numbers, and a measurement report has them.
 fn expect_shown_and_reported(directory: &Path) {
     let at = |name: &str| directory.join(name);
@@ -141,11 +149,22 @@ fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
     expect_foreshortening(&tree, lesion);
     expect_the_same_in_c(&ill.join("run"), &tree);
     expect_shown_and_reported(&ill);
+    let scores = lesion_scores(&ill.join("run"));
+    let counts = ["true_lesions", "found", "false_lesions", "severe_false_lesions"].map(|field| scores[field].as_u64());
+    assert_eq!(counts, [Some(1), Some(1), Some(0), Some(0)], "{scores}");
+    // The tree of all phases is sampled as that of one phase.
+    let radius_mm = 0.5 * (number(lesion, "min_diameter_mm") - number(true_lesion, "min_diameter_mm"));
+    assert!((number(&scores, "min_radius_error_mm") - radius_mm).abs() < 0.01, "{scores}");
+    let points = off("stenosis_percent", "percent");
+    assert!((number(&scores, "percent_absolute_error") - points).abs() < 0.5, "{scores}");
+    assert_eq!(scores["within_10_points"], u64::from(points <= 10.0), "{scores}");
 
     let (truth, tree, said) = lesions_of(&healthy, &[]);
     assert!(truth.get("lesions").is_none(), "a truth without lesions has no such field");
     assert_eq!(tree["lesions"].as_array().unwrap().len(), 0, "{}", tree["lesions"]);
     assert!(!said.contains("stenosis"), "{said}");
+    let scores = lesion_scores(&healthy.join("run"));
+    assert_eq!((scores["true_lesions"].as_u64(), scores["false_lesions"].as_u64()), (Some(0), Some(0)), "{scores}");
 }
 
 #[test]

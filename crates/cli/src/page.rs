@@ -190,7 +190,10 @@ impl Page<'_> {
         let Some(evaluation) = self.evaluation else { return html! {} };
         html! {
             @if let Some(volume) = &evaluation.volume { (volume_table::table(volume).markup()) }
-            @if let Some(tree) = &evaluation.tree { (tree_table::table(tree).markup()) }
+            @if let Some(tree) = &evaluation.tree {
+                (tree_table::table(tree).markup())
+                @if let Some(told) = tree.lesions.as_ref().and_then(tree_table::lesions_in_words) { p { (told) } }
+            }
         }
     }
 

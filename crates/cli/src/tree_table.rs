@@ -1,6 +1,7 @@
 //! Scores of a tree as a table.
 
 use super::score_table::{Column, ScoreTable, mm, percent};
+use nertca_vk::score::lesions::{FOUND_WITHIN_MM, LesionScores, RIGHT_WITHIN_POINTS, SEVERE_PERCENT};
 use nertca_vk::score::trees::{TreeAgreement, TreeScores};
 
 const COLUMNS: [Column<TreeAgreement>; 10] = [
@@ -27,4 +28,57 @@ pub fn table(tree: &TreeScores) -> ScoreTable {
     );
     let phases = tree.phases.iter().map(|p| (p.phase, &p.scores));
     ScoreTable::new("Scores of the tree", legend, &COLUMNS, phases, &tree.mean, tree.mean_as_stated.as_ref())
+}
+
+/// Describes the scores of the stenoses in a sentence or two; `None` where there are no stenoses at all.
+pub fn lesions_in_words(scores: &LesionScores) -> Option<String> {
+    if scores.true_lesions + scores.false_lesions == 0 {
+        return None;
+    }
+    let errors = match (scores.min_radius_absolute_error_mm, scores.min_radius_error_mm, scores.percent_absolute_error)
+    {
+        (Some(absolute), Some(mean), Some(points)) => format!(
+            "; their least radius is off by {absolute:.2} mm (mean {mean:+.2} mm), and their diameter stenosis by {points:.0} points"
+        ),
+        _ => String::new(),
+    };
+    Some(format!(
+        "Stenoses at phase {}: {} of {} are found within {FOUND_WITHIN_MM} mm, {} of them to within {RIGHT_WITHIN_POINTS} points{errors}. \
+         {} of the tree's stenoses are false, of which {} have {SEVERE_PERCENT} % or more.",
+        scores.phase,
+        scores.found,
+        scores.true_lesions,
+        scores.within_10_points,
+        scores.false_lesions,
+        scores.severe_false_lesions
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stenoses_are_told_where_there_are_any() {
+        let scores = LesionScores {
+            phase: 0,
+            true_lesions: 3,
+            found: 2,
+            within_10_points: 1,
+            min_radius_error_mm: Some(-0.05),
+            min_radius_absolute_error_mm: Some(0.08),
+            percent_absolute_error: Some(7.4),
+            false_lesions: 1,
+            severe_false_lesions: 0,
+        };
+        let told = lesions_in_words(&scores).unwrap_or_default();
+        assert!(
+            told.starts_with("Stenoses at phase 0: 2 of 3 are found within 5 mm, 1 of them to within 10 points"),
+            "{told}"
+        );
+        assert!(told.contains("off by 0.08 mm (mean -0.05 mm)") && told.contains("by 7 points"), "{told}");
+        assert!(told.ends_with("1 of the tree's stenoses are false, of which 0 have 50 % or more."), "{told}");
+        let none = LesionScores { true_lesions: 0, false_lesions: 0, ..scores };
+        assert_eq!(lesions_in_words(&none), None);
+    }
 }

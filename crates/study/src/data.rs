@@ -9,6 +9,7 @@ use nertca_vk::gpu::device::Gpu;
 use nertca_vk::phantom::dataset::{Anatomy, PhantomOptions, Setting, make};
 use nertca_vk::phantom::degradations::{Breathing, Degradations, GeometryError, Rhythm};
 use nertca_vk::phantom::noise::Photons;
+use nertca_vk::phantom::stenosis::Stenosis;
 use nertca_vk::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
 use nertca_vk::scan::dataset::Layout;
 use serde::{Deserialize, Serialize};
@@ -65,6 +66,9 @@ pub struct PhantomSection {
     inflow_s: Option<f64>,
     heart: Option<Rhythm>,
     collimated_share: Option<f64>,
+    /// Stenoses, the same in all runs. Data without them keep the fingerprint that they had before this key existed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    stenoses: Option<Vec<Stenosis>>,
 }
 
 impl PhantomSection {
@@ -93,6 +97,7 @@ impl PhantomSection {
             inflow_s: self.inflow_s.or(common.inflow_s),
             heart: self.heart.or(common.heart),
             collimated_share: self.collimated_share.or(common.collimated_share),
+            stenoses: self.stenoses.or(common.stenoses),
         }
     }
 
@@ -260,7 +265,7 @@ pub(super) fn phantoms(
             phases: section.phases.unwrap_or(USUAL_PHASES),
             views: angles,
             seed: 0,
-            stenoses: Vec::new(),
+            stenoses: section.stenoses.clone().unwrap_or_default(),
             degradations: degradations.clone(),
             layout: Layout::Native,
             anatomy: anatomy.clone(),
@@ -342,5 +347,25 @@ impl DataSet {
         make(gpu, &options, &place, progress)?;
         files::write_atomic(&stamp, files::pretty_json(&wanted)?.as_bytes())?;
         Ok(place)
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "tests")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stenoses_reach_the_phantom_and_other_data_keep_their_fingerprint() {
+        let section = |text: &str| toml::from_str::<PhantomSection>(text).unwrap();
+        let stated = section("stenoses = [{ branch = \"LAD\", position_mm = 10, percent = 60, length_mm = 6 }]");
+        let places = Places::new([]);
+        let sets = phantoms("ill", "ill", &stated, &places).unwrap();
+        let Source::Phantom(phantom) = &sets[0].source else { panic!("a phantom") };
+        let [stenosis] = &phantom.options.stenoses[..] else { panic!("{:?}", phantom.options.stenoses) };
+        assert_eq!((stenosis.branch.as_str(), stenosis.percent), ("LAD", 60.0));
+        // The text of a section decides its fingerprint.
+        assert!(!serde_json::to_string(&section("size = 64")).unwrap().contains("stenoses"));
+        assert!(toml::from_str::<PhantomSection>("stenoses = [{ branch = \"LAD\" }]").is_err(), "fields are missing");
     }
 }
