@@ -6,11 +6,13 @@
 
 mod adjusting;
 mod corrected;
-mod engine;
 mod inbox;
 mod known;
 mod long_work;
 mod progress;
+mod showing;
+mod state;
+mod training;
 mod truth;
 
 use crate::calibrate::correction::Calibration;
@@ -32,13 +34,13 @@ use crate::trees::doubt::state_doubt;
 use crate::trees::extract::{TreeOptions, vessel_trees};
 use crate::trees::tree::{BeatTree, TreeView};
 pub use corrected::CorrectedFrame;
-pub use engine::Drawn;
-use engine::{Control, Shared, lock, nothing_yet};
 pub use inbox::{FrameStatus, FrameTime, FrameUse, NewFrame, SessionOptions};
 use inbox::{Inbox, Kept};
 use known::TrueShapes;
 use long_work::{LongCall, LongWork};
 pub use progress::{Observer, Progress, State};
+pub use state::Drawn;
+use state::{Control, Shared, lock, nothing_yet};
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, TryLockError};
 use std::thread::JoinHandle;

@@ -7,8 +7,8 @@ use crate::score::eval::{Evaluation, evaluate, moving_field_warning};
 use crate::score::trees::{self, TrueLine};
 use crate::score::volume::{MAX_VOXELS, TrueVessels, score_known};
 use crate::session::Session;
-use crate::session::engine::lock;
 use crate::session::known::{between, check_lines};
+use crate::session::state::lock;
 use std::collections::BTreeMap;
 
 impl Session {

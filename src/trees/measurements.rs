@@ -117,7 +117,7 @@ fn number(name: Code, value: f64, unit: Code) -> ContentItem {
     contains(name, Value::Number((PER_UNIT * value).round() / PER_UNIT, unit))
 }
 
-/// What a group of measurements is about.
+/// Subject of a group of measurements.
 struct Subject {
     /// Name for people.
     name: String,

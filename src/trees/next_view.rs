@@ -100,7 +100,7 @@ pub fn candidates(subject: &Subject<'_>, limits: &ArmLimits) -> Result<Vec<Candi
     positions.par_iter().map(|(primary, secondary)| subject.candidate(&known, *primary, *secondary)).collect()
 }
 
-/// What the training views tell about the points of a tree.
+/// Information of the training views about the points of a tree.
 struct Known {
     /// Information about each point, `[branch][point]`.
     information: Vec<Vec<Information>>,

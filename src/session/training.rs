@@ -1,29 +1,23 @@
-//! Training of a session and its source for drawing, shared by the session's threads.
+//! Training of a session: new frames are taken in, views adjusted, iterations run in the background.
 
 use crate::calibrate::calibrate;
 use crate::calibrate::correction::Calibration;
-use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::fitting::fit::AdjustTask;
 use crate::gpu::device::Gpu;
-use crate::gpu::pipeline::KeptPipelines;
 use crate::kernels::tuning::Tuning;
 use crate::methods;
 use crate::model::Model;
 use crate::model::scene::Scene;
 use crate::plan::Plan;
-use crate::render::live::{Live, Refresh, Source};
-use crate::render::quantity::Quantity;
-use crate::render::renderer::Interlude;
+use crate::render::live::Source;
 use crate::session::adjusting::{AdjustedViews, CorrectedViews, adjust};
-use crate::session::inbox::{Inbox, Taken};
-use crate::session::long_work::{LongViewer, LongWork};
 use crate::session::progress::{Observer, Progress, State};
+use crate::session::state::{Engine, Settling, Shared, Viewer, lock};
 use crate::train::trainer::Trainer;
 use crate::train::training::Training;
-use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread::ThreadId;
+use std::sync::PoisonError;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 /// Pause after taking in new frames, as a multiple of the time that took.
@@ -37,95 +31,6 @@ const WAITING: Duration = Duration::from_secs(1);
 /// Interval at which training looks again while others wait for the engine.
 const GIVE_WAY: Duration = Duration::from_micros(200);
 
-pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// State that the threads of a session share.
-pub(super) struct Shared {
-    pub(super) gpu: Option<Gpu>,
-    pub(super) tuning: Option<Tuning>,
-    /// Fits and renderers follow one another, and need the same pipelines.
-    pub(super) _pipelines: Option<KeptPipelines>,
-    pub(super) inbox: Mutex<Inbox>,
-    /// Rises with every change of the inbox.
-    pub(super) version: AtomicU64,
-    pub(super) engine: Mutex<Engine>,
-    /// Number of threads that wait for the engine, other than training in the background.
-    pub(super) visitors: AtomicU32,
-    pub(super) published: Mutex<Published>,
-    /// Calibration of the frames that training uses; none before it begins.
-    pub(super) calibration: Mutex<Option<Calibration>>,
-    /// Iterations handed to the device.
-    pub(super) step: AtomicU32,
-    pub(super) viewer: Mutex<Option<Viewer>>,
-    /// The last live picture.
-    pub(super) drawn: Mutex<Option<Drawn>>,
-    /// Renderer of long work, for which live pictures do not wait. Work under way keeps the source that it began with.
-    pub(super) fields: Mutex<Option<LongViewer>>,
-    pub(super) long_work: LongWork,
-    /// Whether a thread trains at this moment, which then keeps up to date what live pictures show.
-    pub(super) renews: AtomicBool,
-    /// Frames that training took in last.
-    pub(super) taken: Mutex<Taken>,
-    pub(super) control: Mutex<Control>,
-    pub(super) changed: Condvar,
-    pub(super) stop: AtomicBool,
-    pub(super) pause: AtomicBool,
-}
-
-/// The run under way.
-#[derive(Default)]
-pub(super) struct Engine {
-    pub(super) training: Option<Training>,
-    /// State to begin from where there is no trainer, and to fall back to.
-    pub(super) saved: Option<Checkpoint>,
-    /// Version of the inbox from which the trainer was built.
-    pub(super) version: u64,
-    pub(super) frames: u32,
-    /// Version of the inbox whose views were adjusted, or need no adjustment; 0 for none.
-    pub(super) adjusted: u64,
-    /// Pause before new frames are taken in.
-    pub(super) settling: Option<Settling>,
-}
-
-/// Pause by which frames that come one after the other are taken in together: otherwise training would do nothing else.
-#[derive(Clone, Copy)]
-pub(super) struct Settling {
-    /// End of the pause.
-    until: Instant,
-    /// Longest time without a new frame that the pause waits for.
-    quiet: Duration,
-}
-
-/// Source that is drawn.
-#[derive(Default)]
-pub(super) struct Published {
-    pub(super) generation: u64,
-    pub(super) source: Option<Source>,
-    /// Number of frames that the field was fitted to.
-    pub(super) frames: u32,
-}
-
-/// Renderer of live pictures.
-#[derive(Clone)]
-pub(super) struct Viewer {
-    /// Generation of the source that it shows.
-    generation: u64,
-    /// Number of frames that its field was fitted to.
-    frames: u32,
-    live: Arc<Live>,
-}
-
-/// Field that a live picture showed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Drawn {
-    /// Number of frames that it was fitted to; 0 for a checkpoint that was loaded.
-    pub frames: u32,
-    /// Iterations of the oldest part that the picture shows.
-    pub step: u32,
-}
-
 /// Training after the adjustment of views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum AfterAdjusting {
@@ -135,207 +40,7 @@ enum AfterAdjusting {
     TrainsOn,
 }
 
-/// State of training, for those who wait for it.
-pub(super) struct Control {
-    pub(super) state: State,
-    /// Reason why training in the background failed, or why it waits.
-    pub(super) reason: Option<String>,
-    pub(super) worker: Option<ThreadId>,
-    /// When frames or R-peaks came last.
-    pub(super) news: Instant,
-    /// Time between the last two.
-    pub(super) news_apart: Duration,
-    /// Version of the inbox at which training in the background found too few frames.
-    pub(super) waits_at: u64,
-}
-
-pub(super) fn nothing_yet() -> Error {
-    Error::NotReady("there is no reconstruction yet: train first, or load a checkpoint".into())
-}
-
-impl Engine {
-    /// Iterations done.
-    pub(super) fn step(&self) -> u32 {
-        self.training.as_ref().map_or(0, |t| t.trainer().step())
-    }
-
-    /// Counts time and iterations from now on.
-    pub(super) fn start_clock(&mut self) {
-        if let Some(training) = &mut self.training {
-            training.start_clock();
-        }
-    }
-
-    /// Number of iterations of the run.
-    pub(super) fn length(&self) -> u32 {
-        self.training.as_ref().map_or(0, |t| t.trainer().plan().config.train.iterations)
-    }
-}
-
 impl Shared {
-    pub(super) fn device(&self) -> Result<(&Gpu, &Tuning)> {
-        match (&self.gpu, &self.tuning) {
-            (Some(gpu), Some(tuning)) => Ok((gpu, tuning)),
-            _ => Err(Error::NoDevice("the context was created without a device".into())),
-        }
-    }
-
-    /// Locks the engine before training in the background takes it again.
-    pub(super) fn visit(&self) -> MutexGuard<'_, Engine> {
-        self.visitors.fetch_add(1, Ordering::AcqRel);
-        let engine = lock(&self.engine);
-        self.visitors.fetch_sub(1, Ordering::AcqRel);
-        engine
-    }
-
-    /// Shows another source from now on, whose field was fitted to `frames` frames; none for as many as that shown so far.
-    /// Returns the generation of the source.
-    pub(super) fn publish(&self, source: Source, frames: Option<u32>) -> u64 {
-        let generation = {
-            let mut published = lock(&self.published);
-            published.generation += 1;
-            published.source = Some(source);
-            published.frames = frames.unwrap_or(published.frames);
-            published.generation
-        };
-        self.free_fields();
-        generation
-    }
-
-    /// Prepares to draw the first source before it is published, where pictures are requested already: the first picture then does
-    /// not take much longer than others.
-    fn first_viewer(&self, source: &Source, step: u32) -> Result<Option<Arc<Live>>> {
-        let (gpu, _) = self.device()?;
-        if !gpu.looks().are_recent() || lock(&self.published).source.is_some() {
-            return Ok(None);
-        }
-        let live = self.live(source)?;
-        live.bake_static_field(step)?;
-        Ok(Some(Arc::new(live)))
-    }
-
-    /// Frees the memory of the renderer of long work, unless it is in use.
-    fn free_fields(&self) {
-        if let Ok(mut fields) = self.fields.try_lock() {
-            *fields = None;
-        }
-    }
-
-    fn source(&self) -> (u64, u32, Option<Source>) {
-        let published = lock(&self.published);
-        (published.generation, published.frames, published.source.clone())
-    }
-
-    /// Draws a live picture. It waits for earlier pictures and for submits under way, and for nothing else.
-    pub(super) fn with_viewer<T>(
-        &self,
-        phase: f64,
-        quantity: Quantity,
-        draw: impl FnOnce(&Live, (u32, Refresh)) -> Result<T>,
-    ) -> Result<T> {
-        let (gpu, _) = self.device()?;
-        let _drawn = gpu.looks().begin();
-        let step = self.step.load(Ordering::Acquire);
-        let refresh = if self.renews.load(Ordering::Acquire) { Refresh::Beside } else { Refresh::Now };
-        let Viewer { live, frames, .. } = self.viewer(refresh)?;
-        let picture = draw(&live, (step, refresh))?;
-        *lock(&self.drawn) = Some(Drawn { frames, step: live.shown_step(step, phase, quantity) });
-        Ok(picture)
-    }
-
-    /// Returns what draws live pictures. A new source is prepared here, unless the training thread does so.
-    fn viewer(&self, refresh: Refresh) -> Result<Viewer> {
-        let mut viewer = lock(&self.viewer);
-        let (generation, frames, source) = self.source();
-        if let Some(viewer) = &mut *viewer {
-            if viewer.generation == generation {
-                viewer.frames = frames;
-                return Ok(viewer.clone());
-            }
-            if refresh == Refresh::Beside {
-                return Ok(viewer.clone());
-            }
-        }
-        // The memory of the old viewer must be free first.
-        *viewer = None;
-        let live = Arc::new(self.live(&source.ok_or_else(nothing_yet)?)?);
-        Ok(viewer.insert(Viewer { generation, frames, live }).clone())
-    }
-
-    fn live(&self, source: &Source) -> Result<Live> {
-        let (gpu, tuning) = self.device()?;
-        let looks = gpu.looks().clone();
-        let interlude: Interlude = Arc::new(move || {
-            looks.give_way();
-            Ok(())
-        });
-        Live::new(gpu, source, tuning.clone(), Some(interlude))
-    }
-
-    /// Keeps up to date what live pictures show, beside them, in the thread that trains. The earlier source is drawn
-    /// until all that pictures needed lately has been prepared from the new one.
-    pub(super) fn renew_viewer(&self) {
-        let Some(viewer) = lock(&self.viewer).clone() else { return };
-        if self.try_renew(&viewer).is_err() {
-            // The next picture prepares anew, with the memory of the old viewer, and tells its error.
-            *lock(&self.viewer) = None;
-        }
-    }
-
-    /// Brings what live pictures show up to the present iteration; pictures do so themselves from now on.
-    fn stop_renewing(&self) {
-        if self.renews.load(Ordering::Acquire) {
-            self.renew_viewer();
-            let viewer = lock(&self.viewer).clone();
-            // The next picture repeats what fails here, and tells its error.
-            let _ = viewer.map(|viewer| viewer.live.refresh_all_beside(self.step.load(Ordering::Acquire)));
-        }
-        self.renews.store(false, Ordering::Release);
-    }
-
-    fn try_renew(&self, viewer: &Viewer) -> Result<()> {
-        let (gpu, _) = self.device()?;
-        let step = self.step.load(Ordering::Acquire);
-        let (generation, frames, source) = self.source();
-        if viewer.generation == generation {
-            return viewer.live.refresh_beside(step);
-        }
-        let prepared = match source.filter(|_| gpu.looks().are_recent()) {
-            Some(source) => {
-                let live = Arc::new(self.live(&source)?);
-                live.bake_like(&viewer.live, step)?;
-                Some(Viewer { generation, frames, live })
-            }
-            // Nobody looks: the memory is free for training.
-            None => None,
-        };
-        *lock(&self.viewer) = prepared;
-        Ok(())
-    }
-
-    /// Does long work on the fields as they are at its beginning, in slices that live pictures pass. Long work is done one after
-    /// the other.
-    pub(super) fn with_fields<T>(&self, work: impl FnOnce(&Live, u32) -> Result<T>) -> Result<T> {
-        let (gpu, tuning) = self.device()?;
-        let begun = self.long_work.begin();
-        let mut fields = lock(&self.fields);
-        let step = self.step.load(Ordering::Acquire);
-        let (generation, _, source) = self.source();
-        let source = source.ok_or_else(nothing_yet)?;
-        let viewer = match fields.take() {
-            Some(viewer) if viewer.generation == generation => viewer,
-            earlier => {
-                // The memory of the earlier one must be free first.
-                drop(earlier);
-                let call = Arc::new(Mutex::new(begun.clone()));
-                let live = Live::new(gpu, &source, tuning.clone(), Some(LongWork::interlude(gpu, &call)))?;
-                LongViewer { generation, live, call }
-            }
-        };
-        *lock(&viewer.call) = begun;
-        work(&fields.insert(viewer).live, step)
-    }
-
     /// Brings the trainer up to the frames there are; `begin` is called when there are enough new ones.
     pub(super) fn take_in_frames(&self, engine: &mut Engine, begin: impl FnOnce()) -> Result<()> {
         let (gpu, tuning) = self.device()?;
