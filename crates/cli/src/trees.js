@@ -179,9 +179,11 @@ const trees = (() => {
   function legend(element) {
     const texts = DOUBT_MM.map((bound, i) => Number.isFinite(bound) ? `to ${bound} mm` : `above ${DOUBT_MM[i - 1]} mm`);
     element.replaceChildren("Known (68 %): ", ...texts.flatMap((text, i) => {
-      const mark = document.createElement("span");
+      const entry = document.createElement("span"), mark = document.createElement("span");
+      entry.style.cssText = "white-space:nowrap";
       mark.style.cssText = `display:inline-block;width:.8em;height:.8em;background:${DOUBT_COLOURS[i]}`;
-      return [mark, ` ${text}  `];
+      entry.append(mark, ` ${text}`);
+      return [entry, "  "];
     }));
   }
   return {Overlay, branchesAt, cArmProjection, colour, legend, lesionsAt, told};

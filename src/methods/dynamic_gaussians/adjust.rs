@@ -14,11 +14,12 @@ use crate::evidence::ratios::ViewEvidence;
 use crate::evidence::series::Series;
 use crate::fields::scale::dynamic_half;
 use crate::fitting::fit::{AdjustTask, AdjustedFit, MadeGaussians, Observe};
-use crate::gaussians::field::DynamicGaussians;
+use crate::gaussians::field::{DeformableGaussians, DynamicGaussians};
 use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::data::SOFT_HULL_CELLS;
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use crate::methods::dynamic_gaussians::made::fingerprint;
+use crate::methods::dynamic_gaussians::setup::carried_step;
 use crate::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::scan::dataset::Dataset;
@@ -29,6 +30,11 @@ use step::FieldInLoop;
 
 /// Gauss-Newton steps per fit.
 const STEPS: usize = 3;
+/// Iterations of the first fit of a stage, which begins with seeds. Poses found by fits of 120 iterations, as long as that of a run, were no
+/// better.
+const FIRST_ITERATIONS: u32 = 60;
+/// Iterations of the other fits of a stage, each of which goes on from the one before.
+const MORE_ITERATIONS: u32 = 60;
 /// Penalty on squared differences of neighbouring nodes while poses are adjusted.
 const SMOOTHNESS: f64 = 0.02;
 
@@ -85,11 +91,15 @@ pub(super) fn adjust(task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result
     Adjuster { gpu, config, stands, evidence, is_full_size }.run(&calibrated, start, observe)
 }
 
-/// Pruning of components that the images do not support. Wrong poses take the support from ends of vessels.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Pruning {
-    On,
-    Off,
+/// Start of a fit.
+#[derive(Clone, Copy)]
+enum Start<'a> {
+    /// Seeds, all iterations, and pruning, as in the run.
+    Run,
+    /// Seeds, a few iterations. Nothing is pruned here and in the next kind, because wrong poses take the support from ends of vessels.
+    Seeds,
+    /// The field of the fit before, at slightly different poses; a few iterations.
+    Earlier(&'a DeformableGaussians),
 }
 
 /// A fit after all iterations.
@@ -139,14 +149,17 @@ impl Adjuster<'_> {
         let (mut poses, mut number) = (start, 0);
         for stage in &STAGES {
             let end = number + stage.cycles;
+            let mut earlier: Option<DeformableGaussians> = None;
             while number < end {
                 number += 1;
                 // The fits before and after the cycles count as well.
                 let share = f64::from(number) / f64::from(N_CYCLES + 2);
                 let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
                 let config = stage.config(self.config, seed);
-                let fit = self.fit(&self.stands.at(&poses), &config, Pruning::Off, &mut || observe(share))?;
+                let start = earlier.as_ref().map_or(Start::Seeds, Start::Earlier);
+                let fit = self.fit(&self.stands.at(&poses), &config, start, &mut || observe(share))?;
                 let Some(Fitted { trainer, .. }) = fit else { return Ok(None) };
+                earlier = Some(trainer.deformable()?).filter(|field| !field.rest.rows.is_empty());
                 let mut next = poses.clone();
                 let mut field = FieldInLoop::new(&trainer, &self.stands);
                 for _ in 0..STEPS {
@@ -185,7 +198,7 @@ impl Adjuster<'_> {
         dataset: &Dataset,
         proceed: &mut dyn FnMut() -> Result<()>,
     ) -> Result<Option<(f64, MadeGaussians)>> {
-        let fit = self.fit(dataset, self.config, Pruning::On, proceed)?;
+        let fit = self.fit(dataset, self.config, Start::Run, proceed)?;
         let Some(Fitted { mut trainer, losses, fingerprint }) = fit else { return Ok(None) };
         let gaussians = DynamicGaussians::Deformable(trainer.deformable()?);
         let misfit = misfit(trainer.targets(), &trainer.images()?);
@@ -198,10 +211,11 @@ impl Adjuster<'_> {
         &self,
         dataset: &Dataset,
         config: &Config,
-        pruning: Pruning,
+        start: Start<'_>,
         proceed: &mut dyn FnMut() -> Result<()>,
     ) -> Result<Option<Fitted>> {
         proceed()?;
+        let (config, from) = (&start.iterations(config), carried_step(&config.gaussians));
         let half = dynamic_half(config, dataset);
         let motion = SoftMotion::carved(self.evidence.clone(), dataset, half, SOFT_HULL_CELLS);
         let targets = match Targets::new(dataset, &motion, &config.gaussians) {
@@ -213,8 +227,11 @@ impl Adjuster<'_> {
             return Ok(None);
         }
         let fingerprint = fingerprint(&targets, config);
-        let mut trainer = DeformableTrainer::new(self.gpu, targets, config)?;
-        if pruning == Pruning::Off {
+        let mut trainer = match start {
+            Start::Run | Start::Seeds => DeformableTrainer::new(self.gpu, targets, config)?,
+            Start::Earlier(earlier) => DeformableTrainer::going_on(self.gpu, targets, config, earlier, from)?,
+        };
+        if !matches!(start, Start::Run) {
             trainer.keep_unsupported();
         }
         let mut losses = Vec::new();
@@ -223,6 +240,19 @@ impl Adjuster<'_> {
             losses.extend(trainer.advance(config.gaussians.iterations)?);
         }
         Ok(Some(Fitted { trainer, losses, fingerprint }))
+    }
+}
+
+impl Start<'_> {
+    /// Returns settings with the number of iterations of such a fit.
+    fn iterations(self, config: &Config) -> Config {
+        let mut config = config.clone();
+        config.gaussians.iterations = match self {
+            Start::Run => config.gaussians.iterations,
+            Start::Seeds => FIRST_ITERATIONS.min(config.gaussians.iterations),
+            Start::Earlier(_) => carried_step(&config.gaussians) + MORE_ITERATIONS,
+        };
+        config
     }
 }
 

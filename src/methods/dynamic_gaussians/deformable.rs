@@ -163,6 +163,24 @@ impl DeformableTrainer {
         })
     }
 
+    /// Goes on, at an iteration, from a deformable set that was fitted to other images of the same vessels.
+    ///
+    /// # Errors
+    /// As [`DeformableTrainer::with`].
+    pub(super) fn going_on(
+        gpu: &Gpu,
+        targets: Targets,
+        config: &Config,
+        earlier: &DeformableGaussians,
+        step: u32,
+    ) -> Result<DeformableTrainer> {
+        let rest = earlier.rest.in_units(targets.units);
+        let mut trainer = DeformableTrainer::with(gpu, targets, config, &Particles::fresh(rest.rows.clone()))?;
+        let setup = *trainer.deformable_setup();
+        trainer.move_as(&earlier.on_grid(rest, setup), step)?;
+        Ok(trainer)
+    }
+
     /// Returns the fit by which the grid is tracked.
     pub(super) fn tracking(&self) -> Result<Fit> {
         self.joint.tracking(&self.gpu, &self.targets, &self.targets.deformable(&self.config.deformable))

@@ -2,7 +2,6 @@
 
 use crate::config::Config;
 use crate::error::Result;
-use crate::gaussians::particles::Particles;
 use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use crate::methods::dynamic_gaussians::remainder::MIN_PHASES;
@@ -46,12 +45,6 @@ impl Fine {
     /// # Errors
     /// As [`DeformableTrainer::with`] and [`DeformableTrainer::deformable`].
     pub(crate) fn go_on(self, coarse: &DeformableTrainer) -> Result<DeformableTrainer> {
-        let earlier = coarse.deformable()?;
-        let rest = earlier.rest.in_units(self.targets.units);
-        let particles = Particles::fresh(rest.rows.clone());
-        let mut trainer = DeformableTrainer::with(&self.gpu, self.targets, &self.config, &particles)?;
-        let setup = *trainer.deformable_setup();
-        trainer.move_as(&earlier.on_grid(rest, setup), self.from)?;
-        Ok(trainer)
+        DeformableTrainer::going_on(&self.gpu, self.targets, &self.config, &coarse.deformable()?, self.from)
     }
 }
