@@ -295,8 +295,8 @@ mod tests {
         let removed = |primary: f64| {
             all.iter().find(|c| (c.primary_deg, c.secondary_deg) == (primary, 0.0)).unwrap().doubt_removed.unwrap()
         };
-        // The views are 20 degrees apart: depth is known 1 / sqrt(2 sin(10)^2) = 4.07 times worse than a place in an image, and the side
-        // 1 / sqrt(2 cos(10)^2) = 0.72 times, which is the largest error once a view from the side shows the depth.
+        // The views are 20 degrees apart: the error of the depth is 1 / sqrt(2 sin(10)^2) = 4.07 times that of a place in an image. A view
+        // from the side adds 1 to the information about the depth, whose error stays larger than that across, 1 / sqrt(2 cos(10)^2).
         let expected = 1.0 - 1.0 / (1.0 + 2.0 * 10f64.to_radians().sin().powi(2)).sqrt() / 4.072;
         assert!((removed(90.0) - expected).abs() < 0.02, "{} instead of {expected}", removed(90.0));
         assert!(removed(0.0) < 0.02, "between the views it tells nothing new: {}", removed(0.0));
