@@ -121,7 +121,7 @@ fn number(name: Code, value: f64, unit: Code) -> ContentItem {
 struct Subject {
     /// Name for people.
     name: String,
-    /// Number by which the subject is told apart from all others of the report.
+    /// Number that distinguishes the subject from all others of the report.
     key: u128,
     category: Code,
     finding: Code,

@@ -118,7 +118,7 @@ fn lesion_scores(run: &Path) -> Value {
     scores["tree"]["lesions"].clone()
 }
 
-/// The viewer marks the stenoses and tells their numbers, and a measurement report has them.
+/// The viewer marks the stenoses and shows their numbers, and a measurement report has them.
 fn expect_shown_and_reported(directory: &Path) {
     let at = |name: &str| directory.join(name);
     for name in ["all.json", "all.dcm"] {

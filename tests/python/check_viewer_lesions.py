@@ -1,4 +1,4 @@
-"""Looks at stenoses in the viewer: a square marks each, and a click on its branch tells its numbers.
+"""Looks at stenoses in the viewer: a square marks each, and a click on its branch shows its numbers.
 
     python3 check_viewer_lesions.py URL TREE.json PICTURE.png   # made by tests/cli/stenosis.rs
 """
@@ -22,6 +22,7 @@ with Page(sys.argv[1] + "&tree=1") as page:
     told = page.evaluate("document.getElementById('tree-text').textContent")
     print(told)
     assert told.startswith(f"Branch {lesion['branch']}:"), told
+    # The page rounds halves up, Python to even numbers.
     assert f"stenosis of {lesion['stenosis_percent']:.0f} %" in told or f"stenosis of {lesion['stenosis_percent'] + .01:.0f} %" in told, told
     assert f"{lesion['min_diameter_mm']:.2f} mm instead of {lesion['reference_diameter_mm']:.2f} mm" in told, told
     page.picture(sys.argv[3])

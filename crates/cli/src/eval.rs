@@ -201,8 +201,8 @@ pub fn print_table(evaluation: &Evaluation) {
     }
     if let Some(tree) = &evaluation.tree {
         tree_table::table(tree).print();
-        if let Some(told) = tree.lesions.as_ref().and_then(tree_table::lesions_in_words) {
-            out!("{told}");
+        if let Some(text) = tree.lesions.as_ref().and_then(tree_table::lesions_in_words) {
+            out!("{text}");
         }
     }
 }

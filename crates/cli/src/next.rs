@@ -15,7 +15,7 @@ use nertca_vk::trees::tree::{BeatTree, PhaseTree, TreeView};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
-/// Number of suggestions where nobody asks for another.
+/// Default number of suggestions.
 pub const SUGGESTIONS: usize = 3;
 /// Angle between suggestions, degrees.
 const APART_DEG: f64 = 20.0;

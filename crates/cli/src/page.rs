@@ -192,7 +192,7 @@ impl Page<'_> {
             @if let Some(volume) = &evaluation.volume { (volume_table::table(volume).markup()) }
             @if let Some(tree) = &evaluation.tree {
                 (tree_table::table(tree).markup())
-                @if let Some(told) = tree.lesions.as_ref().and_then(tree_table::lesions_in_words) { p { (told) } }
+                @if let Some(text) = tree.lesions.as_ref().and_then(tree_table::lesions_in_words) { p { (text) } }
             }
         }
     }
