@@ -80,7 +80,8 @@ impl Kind for SharedSemaphore {
 /// Makes a binary semaphore on the device that can be shared through `VK_KHR_external_semaphore_fd`. `*semaphore` is null on
 /// failure. Callable from any thread.
 ///
-/// @return NERTCA_ERROR_DEVICE where the device lacks the extension (`external_semaphore_fd` of `nertca_context_describe`).
+/// @return NERTCA_ERROR_DEVICE where the device does not export semaphores as opaque descriptors (`external_semaphore_fd` of
+/// `nertca_context_describe` is false).
 ///
 /// # Safety
 /// `semaphore` must be writable.

@@ -69,6 +69,15 @@ unsafe extern "system" fn heard(
     vk::FALSE
 }
 
+/// Tells whether a device imports semaphores from opaque file descriptors: some drivers have the extension for other kinds alone.
+unsafe fn imports_semaphores(instance: &ash::Instance, physical: vk::PhysicalDevice) -> bool {
+    let opaque =
+        vk::PhysicalDeviceExternalSemaphoreInfo::default().handle_type(vk::ExternalSemaphoreHandleTypeFlags::OPAQUE_FD);
+    let mut offered = vk::ExternalSemaphoreProperties::default();
+    unsafe { instance.get_physical_device_external_semaphore_properties(physical, &opaque, &mut offered) };
+    offered.external_semaphore_features.contains(vk::ExternalSemaphoreFeatureFlags::IMPORTABLE)
+}
+
 impl Application {
     /// Creates an application with such a device; `None` where the physical device does not offer it.
     fn new(with: With) -> Option<Application> {
@@ -94,7 +103,7 @@ impl Application {
             let known = instance.enumerate_device_extension_properties(physical).unwrap();
             let has = |name| known.iter().any(|e| e.extension_name_as_c_str() == Ok(name));
             let exports = has(ash::khr::external_memory_fd::NAME);
-            let waits = has(ash::khr::external_semaphore_fd::NAME);
+            let waits = has(ash::khr::external_semaphore_fd::NAME) && imports_semaphores(&instance, physical);
             let wanted = match with {
                 With::Least => &[][..],
                 With::Subgroups => &[ash::ext::subgroup_size_control::NAME],

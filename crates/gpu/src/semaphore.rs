@@ -27,11 +27,12 @@ impl Gpu {
     /// Makes a semaphore that can be exported as an opaque file descriptor.
     ///
     /// # Errors
-    /// [`Error::NoDevice`] where `VK_KHR_external_semaphore_fd` is missing; [`Error::OutOfMemory`].
+    /// [`Error::NoDevice`] where `VK_KHR_external_semaphore_fd` is missing or knows no opaque descriptors; [`Error::OutOfMemory`].
     pub fn exported_semaphore(&self) -> Result<ExportedSemaphore> {
         let info = self.info();
         if !info.external_semaphore_fd {
-            let problem = format!("{}: the device does not support VK_KHR_external_semaphore_fd", info.name);
+            let missing = "semaphores as opaque file descriptors (VK_KHR_external_semaphore_fd)";
+            let problem = format!("{}: the device does not export {missing}", info.name);
             return Err(Error::NoDevice(problem));
         }
         let mut export = vk::ExportSemaphoreCreateInfo::default().handle_types(EXPORTED);
