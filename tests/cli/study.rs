@@ -238,6 +238,32 @@ fn a_run_that_fails_is_a_row() {
     assert!(page.contains("data:image/png;base64,") && page.contains("b.m.s1 failed"));
 }
 
+/// Measured results make the tables beside them, and a page with one plot for each data set.
+#[test]
+fn measured_results_make_their_tables_and_plots() {
+    let studies = Path::new(SMOKE).parent().unwrap();
+    for (name, plots) in [("scaled-table1", 6), ("scaled-table2", 2), ("ablation", 2)] {
+        let directory = tempfile::tempdir().unwrap();
+        let (file, out) = (studies.join(format!("{name}.toml")), directory.path());
+        let measured = studies.join("measured").join(name);
+        for run in std::fs::read_dir(measured.join("runs")).unwrap() {
+            let (run, id) = (run.as_ref().unwrap().path(), run.as_ref().unwrap().file_name());
+            std::fs::create_dir_all(out.join("runs").join(&id)).unwrap();
+            std::fs::copy(run.join("result.json"), out.join("runs").join(&id).join("result.json")).unwrap();
+        }
+        ok(&["table", text(&file), "-o", text(out)]);
+        for table in ["table.md", "table.csv", "table.tex"] {
+            let read = |directory: &Path| std::fs::read_to_string(directory.join(table)).unwrap();
+            assert!(read(out) == read(&measured), "{name}/{table} is not the table of its results");
+        }
+        let printed = ok(&["report", text(&file), "-o", text(out)]);
+        let pictures: Vec<&str> = printed.lines().filter(|line| line.ends_with(".svg")).collect();
+        assert_eq!(pictures.len(), plots, "{printed}");
+        let plot = std::fs::read_to_string(pictures[0]).unwrap();
+        assert!(plot.contains("XCAT-like, ") && plot.contains(", NVIDIA H100"), "data and devices have names");
+    }
+}
+
 #[cfg(unix)]
 #[test]
 #[ignore = "long: tools/test --all"]

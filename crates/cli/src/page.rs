@@ -63,7 +63,7 @@ h1{font-size:1.6rem;margin:0}h2{font-size:1.15rem;margin:2.2rem 0 .6rem}p.lead{c
 table{border-collapse:collapse;font-variant-numeric:tabular-nums}td,th{padding:.2rem .8rem .2rem 0;text-align:right;border-bottom:1px solid var(--line)}
 th:first-child,td:first-child{text-align:left}.facts td{text-align:left}.facts td:first-child{color:var(--soft)}
 .numbers{display:flex;flex-wrap:wrap;gap:2.5rem;margin:1rem 0}.numbers b{display:block;font-size:1.7rem;font-weight:600}
-.warn{border-left:3px solid var(--mark);padding:.2rem .8rem;margin:.4rem 0}.plot svg{width:100%;height:auto;max-width:56rem}
+.warn{border-left:3px solid var(--mark);padding:.2rem .8rem;margin:.4rem 0}.plot svg{width:100%;height:auto;max-width:66rem}
 fieldset{border:0;padding:0;margin:0 0 1.5rem}legend{padding:0;color:var(--soft)}input.p{position:absolute;opacity:0}
 label.p{display:inline-block;min-width:1.6rem;text-align:center;padding:.1rem .4rem;border:1px solid var(--line);cursor:pointer}
 input.p:focus-visible+label.p{outline:2px solid}.shot{display:none}.shot img{width:100%;image-rendering:pixelated}
@@ -98,11 +98,13 @@ impl Page<'_> {
             name: name.into(),
             colour,
             points: losses.iter().filter_map(|l| Some((l.elapsed_s, pick(l)?))).collect(),
+            published: false,
         };
         let score = |name: &str, colour: RGBColor, pick: fn(&Validated) -> Option<f64>| Line {
             name: name.into(),
             colour,
             points: curve.iter().filter_map(|v| Some((v.train_s, pick(v)?))).collect(),
+            published: false,
         };
         let plots = [
             plot("Loss", &[loss("data", blue, |l| l.data), loss("dynamic field", orange, |l| l.dynamic)], true)?,

@@ -12,10 +12,12 @@ pub struct Line {
     pub colour: RGBColor,
     /// Seconds and values.
     pub points: Vec<(f64, f64)>,
+    /// Whether the points are published ones, which are drawn as rings.
+    pub published: bool,
 }
 
 /// Size of a plot, pixels.
-const SIZE: (u32, u32) = (900, 320);
+const SIZE: (u32, u32) = (1060, 320);
 /// Width of the curves; the legend is beside them.
 const CURVES: u32 = 610;
 /// Colour of the paper's time.
@@ -89,7 +91,8 @@ pub fn plot(title: &str, lines: &[Line], log_y: bool) -> Result<String> {
             let style = colour.stroke_width(2);
             chart.draw_series(LineSeries::new(line.points.iter().map(at), style)).map_err(|e| fault(&e))?;
             if line.points.len() < 40 {
-                let dots = line.points.iter().map(|p| Circle::new(at(p), 3, colour.filled()));
+                let (radius, style) = if line.published { (5, style) } else { (3, colour.filled()) };
+                let dots = line.points.iter().map(|p| Circle::new(at(p), radius, style));
                 chart.draw_series(dots).map_err(|e| fault(&e))?;
             }
         }

@@ -42,7 +42,8 @@ pub enum StudyCommand {
     List(ListArgs),
     /// Write table.md, table.csv and table.tex into DIR, and the first to stdout.
     Table(PlaceArgs),
-    /// Write report.html into DIR: the table, Dice over time, and pictures of all methods.
+    /// Write report.html into DIR: the table, Dice over time, and pictures of all methods; and dice-DATA.svg, Dice over time
+    /// for each data set.
     Report(PlaceArgs),
 }
 
@@ -253,9 +254,9 @@ fn table(args: &PlaceArgs) -> Result<()> {
 }
 
 fn report(args: &PlaceArgs) -> Result<()> {
-    let page = args.out.join("report.html");
-    study_page::write(&args.study.read()?, &args.out, &page)?;
-    out!("{}", page.display());
+    for name in study_page::write(&args.study.read()?, &args.out)? {
+        out!("{}", args.out.join(name).display());
+    }
     Ok(())
 }
 

@@ -1,4 +1,5 @@
-//! The page of a study: its table, Dice over the time of training, and pictures side by side. It is self-contained.
+//! The page of a study: its table, Dice over the time of training, and pictures side by side. It is self-contained; the plots of Dice
+//! are written beside it as well.
 
 use super::page::{DISTANCE_TITLE, STYLE, embedded};
 use super::plot::{Line, plot};
@@ -31,20 +32,31 @@ struct Finished {
     outcome: Outcome,
 }
 
-/// Writes the page.
+/// Name of the page in the directory of a study.
+const PAGE: &str = "report.html";
+
+/// Writes the page and one plot of Dice for each data set; returns the names of these files.
 ///
 /// # Errors
 /// Errors of results and pictures that cannot be read, and of writing.
-pub fn write(study: &Study, directory: &Path, page: &Path) -> Result<()> {
+pub fn write(study: &Study, directory: &Path) -> Result<Vec<String>> {
     let table = Table::gather(study, directory)?;
     let finished = finished(study, directory)?;
+    let mut written = vec![PAGE.to_owned()];
     let sections = (0..study.data.len())
         .map(|data| {
             let of_data: Vec<&Finished> = finished.iter().filter(|f| f.run.data == data).collect();
+            let plots = curves(study, &of_data)?;
+            if !plots[0].is_empty() {
+                let name = format!("dice-{}.svg", study.data[data].id);
+                files::write_atomic(&directory.join(&name), plots[0].as_bytes())?;
+                written.push(name);
+            }
             Ok(html! {
                 @if !of_data.is_empty() {
-                    h2 { (study.data[data].label) @if let Some(views) = study.data[data].views { ", " (views) " views" } }
-                    (curves(study, &of_data)?)
+                    h2 { (heading(&study.data[data])) }
+                    p.lead { "Curves are of some unseen images, single dots of all of them at the end of a run." }
+                    @for svg in &plots { @if !svg.is_empty() { div.plot { (PreEscaped(svg)) } } }
                     (pictures(study, directory, &of_data)?)
                 }
             })
@@ -68,7 +80,13 @@ pub fn write(study: &Study, directory: &Path, page: &Path) -> Result<()> {
             }
         }
     };
-    Ok(files::write_atomic(page, text.into_string().as_bytes())?)
+    files::write_atomic(&directory.join(PAGE), text.into_string().as_bytes())?;
+    Ok(written)
+}
+
+/// Returns the name of a data set and its number of views.
+fn heading(set: &DataSet) -> String {
+    set.views.map_or_else(|| set.label.clone(), |views| format!("{}, {views} views", set.label))
 }
 
 /// Returns the runs that have a result for the study's current inputs.
@@ -105,43 +123,52 @@ fn rows(table: &Table) -> Markup {
     }
 }
 
-/// Plots Dice, and distances to true vessels, over the time of training.
-fn curves(study: &Study, finished: &[&Finished]) -> Result<Markup> {
-    let mut dice = lines(study, finished, |point| point.dice);
-    if let Some(Finished { run, .. }) = finished.first().filter(|_| !dice.is_empty()) {
-        dice.extend(published_ends(study, &study.data[run.data]));
+/// Plots Dice, and distances to true vessels, over the time of training, as SVG; empty where no run was validated during training.
+fn curves(study: &Study, finished: &[&Finished]) -> Result<[String; 2]> {
+    let Some(Finished { run, .. }) = finished.first() else { return Ok([String::new(), String::new()]) };
+    let set = &study.data[run.data];
+    let mut dice = lines(study, finished, |point| point.dice, Score::Dice);
+    if !dice.is_empty() {
+        dice.extend(published_ends(study, set));
     }
-    let distances = lines(study, finished, |point| point.chamfer_mm);
-    let plots = [
-        plot("Dice of the dynamic field on some unseen images", &dice, false)?,
-        plot(DISTANCE_TITLE, &distances, false)?,
-    ];
-    Ok(html! { @for svg in plots { @if !svg.is_empty() { div.plot { (PreEscaped(svg)) } } } })
+    let distances = lines(study, finished, |point| point.chamfer_mm, Score::ChamferMm);
+    let title = format!("{}: Dice of the dynamic field", heading(set));
+    Ok([plot(&title, &dice, false)?, plot(DISTANCE_TITLE, &distances, false)?])
 }
 
-/// Makes one line per run, with one colour per method.
-fn lines(study: &Study, finished: &[&Finished], pick: fn(&CurvePoint) -> Option<f64>) -> Vec<Line> {
+/// Makes one line per run, with one colour per method, and a single dot where only the final score is known. Names include the device
+/// where runs have several.
+fn lines(study: &Study, finished: &[&Finished], pick: fn(&CurvePoint) -> Option<f64>, at_end: Score) -> Vec<Line> {
     let mut lines: Vec<Line> = Vec::new();
+    let one_device = finished.windows(2).all(|pair| pair[0].outcome.device == pair[1].outcome.device);
     for Finished { run, outcome } in finished {
-        let points: Vec<(f64, f64)> = outcome.curve.iter().filter_map(|p| Some((p.train_s, pick(p)?))).collect();
-        if points.is_empty() {
-            continue;
+        let mut points: Vec<(f64, f64)> = outcome.curve.iter().filter_map(|p| Some((p.train_s, pick(p)?))).collect();
+        let end = outcome.score(at_end);
+        match end {
+            Some(end) if points.is_empty() => points.push((outcome.seconds.training, end)),
+            None if points.is_empty() => continue,
+            _ => {}
         }
         let label = &study.methods[run.method].label;
-        let name = if lines.iter().any(|line| line.name == *label) { String::new() } else { label.clone() };
-        lines.push(Line { name, colour: COLOURS[run.method % COLOURS.len()], points });
+        // Drivers add versions and widths in brackets.
+        let device = outcome.device.split(" (").next().unwrap_or_default();
+        let label = if one_device { label.clone() } else { format!("{label}, {device}") };
+        let name = if lines.iter().any(|line| line.name == label) { String::new() } else { label };
+        lines.push(Line { name, colour: COLOURS[run.method % COLOURS.len()], points, published: false });
     }
     lines
 }
 
-/// Returns the final points of published runs on a data set, as far as they are known.
+/// Returns the final points of published runs on a data set, as far as they are known, in the colour of the study's own runs of the
+/// method.
 fn published_ends(study: &Study, set: &DataSet) -> Vec<Line> {
     let Some(published) = &study.published else { return Vec::new() };
     let end = |(index, method): (usize, &str)| {
         let value = |score| published.value(method, &set.name, set.views, score);
         let points = vec![(60.0 * value(Score::Minutes)?, value(Score::Dice)?)];
-        let colour = COLOURS[(study.methods.len() + index) % COLOURS.len()];
-        Some(Line { name: format!("{method}, as published"), colour, points })
+        let ours = study.methods.iter().position(|m| m.published.as_deref() == Some(method));
+        let colour = COLOURS[ours.unwrap_or(study.methods.len() + index) % COLOURS.len()];
+        Some(Line { name: format!("{method}, as published"), colour, points, published: true })
     };
     published.methods().into_iter().enumerate().filter_map(end).collect()
 }
