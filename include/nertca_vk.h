@@ -1481,6 +1481,20 @@ nertca_status nertca_buffer_export_fd(nertca_buffer *buffer,
                                       uint64_t *bytes);
 
 /**
+ * Returns the type and the size of the buffer's memory, with which others import it: the index of the type in
+ * `VkPhysicalDeviceMemoryProperties`, and the size of the allocation in bytes, at least that of the buffer. A Vulkan device must
+ * import the memory with both, with `VkMemoryDedicatedAllocateInfo`, for a buffer of the size of `nertca_buffer_export_fd` with
+ * the usages storage buffer, transfer source and transfer destination; CUDA and OpenGL need the size of the allocation. The type
+ * may be one that the host cannot read. Callable from any thread.
+ *
+ * # Safety
+ * `memory_type` and `bytes` must be writable.
+ */
+nertca_status nertca_buffer_memory(nertca_buffer *buffer,
+                                   uint32_t *memory_type,
+                                   uint64_t *bytes);
+
+/**
  * Destroys a buffer; memory that others imported stays valid for them. Null is allowed, and does nothing. Waits for calls on
  * the buffer in other threads.
  */

@@ -367,6 +367,38 @@ pub unsafe extern "C" fn nertca_buffer_export_fd(
     })
 }
 
+/// Returns the type and the size of the buffer's memory, with which others import it: the index of the type in
+/// `VkPhysicalDeviceMemoryProperties`, and the size of the allocation in bytes, at least that of the buffer. A Vulkan device must
+/// import the memory with both, with `VkMemoryDedicatedAllocateInfo`, for a buffer of the size of `nertca_buffer_export_fd` with
+/// the usages storage buffer, transfer source and transfer destination; CUDA and OpenGL need the size of the allocation. The type
+/// may be one that the host cannot read. Callable from any thread.
+///
+/// # Safety
+/// `memory_type` and `bytes` must be writable.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_buffer_memory(
+    buffer: *mut nertca_buffer,
+    memory_type: *mut u32,
+    bytes: *mut u64,
+) -> nertca_status {
+    call(buffer, || {
+        let shared = handles::get::<SharedBuffer, _>(buffer)?;
+        if memory_type.is_null() {
+            return Err(Failure::argument("memory_type", "is null"));
+        }
+        if bytes.is_null() {
+            return Err(Failure::argument("bytes", "is null"));
+        }
+        let (index, allocated) = shared.memory.type_and_bytes();
+        // SAFETY: neither is null, and the header requires that both can be written.
+        unsafe {
+            memory_type.write_unaligned(index);
+            bytes.write_unaligned(allocated);
+        }
+        Ok(())
+    })
+}
+
 /// Destroys a buffer; memory that others imported stays valid for them. Null is allowed, and does nothing. Waits for calls on
 /// the buffer in other threads.
 #[unsafe(no_mangle)]

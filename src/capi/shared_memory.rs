@@ -9,21 +9,27 @@ use crate::gpu::device::Gpu;
 mod system {
     use super::{Buffer, Gpu, Result};
     use crate::error::Error;
-    use std::os::fd::{AsFd, IntoRawFd, OwnedFd};
+    use crate::gpu::buffer::ExportedMemory;
+    use std::os::fd::{AsFd, IntoRawFd};
 
-    /// Descriptor of a buffer's memory, for import by others.
-    pub struct Memory(OwnedFd);
+    /// Memory of a buffer, for import by others.
+    pub struct Memory(ExportedMemory);
 
     pub fn make(gpu: &Gpu, bytes: u64) -> Result<(Buffer, Memory)> {
-        let (buffer, fd) = gpu.exported_buffer("shared buffer", bytes)?;
-        Ok((buffer, Memory(fd)))
+        let (buffer, memory) = gpu.exported_buffer("shared buffer", bytes)?;
+        Ok((buffer, Memory(memory)))
     }
 
     impl Memory {
         /// Returns a new descriptor of the memory, which the caller owns.
         pub fn descriptor(&self) -> Result<i32> {
-            let copy = self.0.as_fd().try_clone_to_owned();
+            let copy = self.0.descriptor.as_fd().try_clone_to_owned();
             Ok(copy.map_err(Error::io("duplicate the descriptor of", "a shared buffer"))?.into_raw_fd())
+        }
+
+        /// Returns the index of the memory's type, and the size of the allocation in bytes.
+        pub fn type_and_bytes(&self) -> (u32, u64) {
+            (self.0.memory_type, self.0.allocated_bytes)
         }
     }
 }
@@ -42,6 +48,10 @@ mod system {
 
     impl Memory {
         pub fn descriptor(&self) -> Result<i32> {
+            match *self {}
+        }
+
+        pub fn type_and_bytes(&self) -> (u32, u64) {
             match *self {}
         }
     }

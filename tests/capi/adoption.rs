@@ -200,66 +200,112 @@ impl Application {
         assert_eq!(*self.messages.lock().unwrap(), Vec::<String>::new());
     }
 
-    /// Imports the semaphore of a descriptor, and lets the device wait for it.
-    fn wait_for(&self, fd: i32) {
-        /// A signal that was submitted arrives long before, in nanoseconds.
-        const PATIENCE: u64 = 60_000_000_000;
-        unsafe {
-            let semaphore = self.device.create_semaphore(&vk::SemaphoreCreateInfo::default(), None).unwrap();
-            let import = vk::ImportSemaphoreFdInfoKHR::default()
-                .semaphore(semaphore)
-                .handle_type(vk::ExternalSemaphoreHandleTypeFlags::OPAQUE_FD)
-                .fd(fd);
-            let imports = ash::khr::external_semaphore_fd::Device::new(&self.instance, &self.device);
-            imports.import_semaphore_fd(&import).unwrap();
-            let fence = self.device.create_fence(&vk::FenceCreateInfo::default(), None).unwrap();
-            let (semaphores, stages) = ([semaphore], [vk::PipelineStageFlags::ALL_COMMANDS]);
-            let submit = vk::SubmitInfo::default().wait_semaphores(&semaphores).wait_dst_stage_mask(&stages);
-            let queue = self.device.get_device_queue(0, 0);
-            self.device.queue_submit(queue, &[submit], fence).unwrap();
-            self.device.wait_for_fences(&[fence], true, PATIENCE).expect("the semaphore was signalled");
-            self.device.destroy_fence(fence, None);
-            self.device.destroy_semaphore(semaphore, None);
-        }
+    /// Makes a semaphore of the device from a descriptor.
+    unsafe fn imported_semaphore(&self, fd: i32) -> vk::Semaphore {
+        let semaphore = unsafe { self.device.create_semaphore(&vk::SemaphoreCreateInfo::default(), None) }.unwrap();
+        let import = vk::ImportSemaphoreFdInfoKHR::default()
+            .semaphore(semaphore)
+            .handle_type(vk::ExternalSemaphoreHandleTypeFlags::OPAQUE_FD)
+            .fd(fd);
+        let imports = ash::khr::external_semaphore_fd::Device::new(&self.instance, &self.device);
+        unsafe { imports.import_semaphore_fd(&import) }.unwrap();
+        semaphore
     }
 
-    /// Reads the memory of a descriptor, imported as another API would.
-    fn import(&self, fd: i32, bytes: u64) -> Vec<f32> {
-        unsafe {
-            let opaque = vk::ExternalMemoryHandleTypeFlags::OPAQUE_FD;
-            let mut external = vk::ExternalMemoryBufferCreateInfo::default().handle_types(opaque);
-            let usage = vk::BufferUsageFlags::TRANSFER_SRC
-                | vk::BufferUsageFlags::STORAGE_BUFFER
-                | vk::BufferUsageFlags::TRANSFER_DST;
-            let create = vk::BufferCreateInfo::default().size(bytes).usage(usage).push_next(&mut external);
-            let buffer = self.device.create_buffer(&create, None).unwrap();
-            let needs = self.device.get_buffer_memory_requirements(buffer);
-            let types = self.instance.get_physical_device_memory_properties(self.physical);
-            let kind = (0..types.memory_type_count)
-                .find(|i| {
+    /// Makes a buffer, with memory that `import` imports or, without it, that the host reads.
+    unsafe fn buffer(&self, bytes: u64, import: Option<&Exported>) -> (vk::Buffer, vk::DeviceMemory) {
+        let opaque = vk::ExternalMemoryHandleTypeFlags::OPAQUE_FD;
+        let mut external = vk::ExternalMemoryBufferCreateInfo::default().handle_types(opaque);
+        let usage = vk::BufferUsageFlags::TRANSFER_SRC
+            | vk::BufferUsageFlags::STORAGE_BUFFER
+            | vk::BufferUsageFlags::TRANSFER_DST;
+        let mut create = vk::BufferCreateInfo::default().size(bytes).usage(usage);
+        if import.is_some() {
+            create = create.push_next(&mut external);
+        }
+        let buffer = unsafe { self.device.create_buffer(&create, None) }.unwrap();
+        let mut info = vk::ImportMemoryFdInfoKHR::default().handle_type(opaque).fd(import.map_or(-1, |i| i.fd));
+        let mut dedicated = vk::MemoryDedicatedAllocateInfo::default().buffer(buffer);
+        let allocate = match import {
+            Some(Exported { memory_type, allocated, .. }) => vk::MemoryAllocateInfo::default()
+                .allocation_size(*allocated)
+                .memory_type_index(*memory_type)
+                .push_next(&mut info)
+                .push_next(&mut dedicated),
+            None => {
+                let needs = unsafe { self.device.get_buffer_memory_requirements(buffer) };
+                let memory = unsafe { self.instance.get_physical_device_memory_properties(self.physical) };
+                let read = vk::MemoryPropertyFlags::HOST_VISIBLE | vk::MemoryPropertyFlags::HOST_COHERENT;
+                let fits = |i: &u32| {
                     needs.memory_type_bits >> i & 1 == 1
-                        && types.memory_types[*i as usize]
-                            .property_flags
-                            .contains(vk::MemoryPropertyFlags::DEVICE_LOCAL | vk::MemoryPropertyFlags::HOST_VISIBLE)
-                })
-                .unwrap();
-            let mut import = vk::ImportMemoryFdInfoKHR::default().handle_type(opaque).fd(fd);
-            let mut dedicated = vk::MemoryDedicatedAllocateInfo::default().buffer(buffer);
-            let allocate = vk::MemoryAllocateInfo::default()
-                .allocation_size(needs.size)
-                .memory_type_index(kind)
-                .push_next(&mut import)
-                .push_next(&mut dedicated);
-            let memory = self.device.allocate_memory(&allocate, None).unwrap();
-            self.device.bind_buffer_memory(buffer, memory, 0).unwrap();
-            let mapped = self.device.map_memory(memory, 0, bytes, vk::MemoryMapFlags::empty()).unwrap();
+                        && memory.memory_types[*i as usize].property_flags.contains(read)
+                };
+                let kind = (0..memory.memory_type_count).find(fits).unwrap();
+                vk::MemoryAllocateInfo::default().allocation_size(needs.size).memory_type_index(kind)
+            }
+        };
+        let memory = unsafe { self.device.allocate_memory(&allocate, None) }.unwrap();
+        unsafe { self.device.bind_buffer_memory(buffer, memory, 0) }.unwrap();
+        (buffer, memory)
+    }
+
+    /// Reads exported memory as another API would, through a copy on the device that waits for the semaphore of a descriptor.
+    fn import(&self, exported: &Exported, signal: Option<i32>) -> Vec<f32> {
+        /// A signal that was submitted arrives long before, in nanoseconds.
+        const PATIENCE: u64 = 60_000_000_000;
+        let (bytes, device) = (exported.bytes, &self.device);
+        unsafe {
+            let (theirs, ours) = (self.buffer(bytes, Some(exported)), self.buffer(bytes, None));
+            let semaphores: Vec<_> = signal.map(|fd| self.imported_semaphore(fd)).into_iter().collect();
+            let pool = device.create_command_pool(&vk::CommandPoolCreateInfo::default(), None).unwrap();
+            let allocate = vk::CommandBufferAllocateInfo::default().command_pool(pool).command_buffer_count(1);
+            let commands = device.allocate_command_buffers(&allocate).unwrap();
+            device.begin_command_buffer(commands[0], &vk::CommandBufferBeginInfo::default()).unwrap();
+            device.cmd_copy_buffer(commands[0], theirs.0, ours.0, &[vk::BufferCopy::default().size(bytes)]);
+            let visible = vk::MemoryBarrier::default()
+                .src_access_mask(vk::AccessFlags::TRANSFER_WRITE)
+                .dst_access_mask(vk::AccessFlags::HOST_READ);
+            let (copy, host) = (vk::PipelineStageFlags::TRANSFER, vk::PipelineStageFlags::HOST);
+            device.cmd_pipeline_barrier(commands[0], copy, host, vk::DependencyFlags::empty(), &[visible], &[], &[]);
+            device.end_command_buffer(commands[0]).unwrap();
+            let stages = vec![vk::PipelineStageFlags::ALL_COMMANDS; semaphores.len()];
+            let submit = vk::SubmitInfo::default()
+                .wait_semaphores(&semaphores)
+                .wait_dst_stage_mask(&stages)
+                .command_buffers(&commands);
+            let fence = device.create_fence(&vk::FenceCreateInfo::default(), None).unwrap();
+            device.queue_submit(device.get_device_queue(0, 0), &[submit], fence).unwrap();
+            device.wait_for_fences(&[fence], true, PATIENCE).expect("the semaphore was signalled");
+            let mapped = device.map_memory(ours.1, 0, bytes, vk::MemoryMapFlags::empty()).unwrap();
             let values = std::slice::from_raw_parts(mapped.cast::<f32>(), bytes as usize / 4).to_vec();
-            self.device.unmap_memory(memory);
-            self.device.destroy_buffer(buffer, None);
-            self.device.free_memory(memory, None);
+            device.unmap_memory(ours.1);
+            device.destroy_fence(fence, None);
+            device.destroy_command_pool(pool, None);
+            semaphores.iter().for_each(|semaphore| device.destroy_semaphore(*semaphore, None));
+            for (buffer, memory) in [theirs, ours] {
+                device.destroy_buffer(buffer, None);
+                device.free_memory(memory, None);
+            }
             values
         }
     }
+}
+
+/// Exported memory of a buffer.
+struct Exported {
+    fd: i32,
+    bytes: u64,
+    memory_type: u32,
+    allocated: u64,
+}
+
+/// Exports the memory of a buffer of the library.
+fn exported(buffer: *mut nertca_buffer) -> Exported {
+    let mut exported = Exported { fd: -1, bytes: 0, memory_type: u32::MAX, allocated: 0 };
+    ok(unsafe { nertca_buffer_export_fd(buffer, &mut exported.fd, &mut exported.bytes) }, buffer);
+    ok(unsafe { nertca_buffer_memory(buffer, &mut exported.memory_type, &mut exported.allocated) }, buffer);
+    assert!(exported.allocated >= exported.bytes);
+    exported
 }
 
 fn adopted(vulkan: &nertca_vulkan, options: &str) -> *mut nertca_context {
@@ -340,18 +386,17 @@ fn a_device_is_shared_with_its_owner() {
     let ours = drawn(made, &view(1));
     if application.exports {
         let bytes = u64::from(SIZE * SIZE * 4);
-        let (mut buffer, mut fd, mut size) = (null_mut(), -1, 0);
+        let mut buffer = null_mut();
         ok(unsafe { nertca_buffer_create(context, bytes, &mut buffer) }, context);
         ok(unsafe { nertca_reconstruction_render_buffer(made, &view(1), buffer) }, made);
-        ok(unsafe { nertca_buffer_export_fd(buffer, &mut fd, &mut size) }, buffer);
-        assert!(size >= bytes);
-        let theirs = application.import(fd, size);
+        let (first, second) = (exported(buffer), exported(buffer));
+        assert!(first.bytes >= bytes && first.fd != second.fd);
+        let theirs = application.import(&first, None);
         assert_eq!(theirs[..ours.len()], ours, "what was drawn, in memory of another API");
         // The memory stays valid after the buffer is freed: a second descriptor outlives the buffer.
-        ok(unsafe { nertca_buffer_export_fd(buffer, &mut fd, null_mut()) }, buffer);
         assert_eq!(unsafe { nertca_context_destroy(context) }, NERTCA_ERROR_BUSY);
         ok(nertca_buffer_destroy(buffer), buffer);
-        assert_eq!(application.import(fd, size)[..ours.len()], ours);
+        assert_eq!(application.import(&second, None)[..ours.len()], ours);
     } else {
         println!("no VK_KHR_external_memory_fd here: sharing memory was not tested");
     }
@@ -381,19 +426,17 @@ fn another_device_waits_for_a_picture() {
     add_frames(made, 0..3);
     train(made, 3);
     let bytes = u64::from(SIZE * SIZE * 4);
-    let (mut buffer, mut semaphore, mut size) = (null_mut(), null_mut(), 0);
+    let (mut buffer, mut semaphore) = (null_mut(), null_mut());
     ok(unsafe { nertca_buffer_create(context, bytes, &mut buffer) }, context);
     ok(unsafe { nertca_semaphore_create(context, &mut semaphore) }, context);
     // A signal that was waited for can be given again.
     for at in [1, 2] {
         let ours = drawn(made, &view(at));
-        let (mut memory, mut signal) = (-1, -1);
+        let mut signal = -1;
         ok(unsafe { nertca_reconstruction_render_buffer(made, &view(at), buffer) }, made);
         ok(nertca_semaphore_signal(semaphore), semaphore);
         ok(unsafe { nertca_semaphore_export_fd(semaphore, &mut signal) }, semaphore);
-        ok(unsafe { nertca_buffer_export_fd(buffer, &mut memory, &mut size) }, buffer);
-        application.wait_for(signal);
-        assert_eq!(application.import(memory, size)[..ours.len()], ours, "view {at}");
+        assert_eq!(application.import(&exported(buffer), Some(signal))[..ours.len()], ours, "view {at}");
     }
     assert_eq!(unsafe { nertca_context_destroy(context) }, NERTCA_ERROR_BUSY);
     ok(nertca_semaphore_destroy(semaphore), semaphore);

@@ -679,6 +679,12 @@ fn buffers(b: &Bench) {
         b.refuses("nertca_buffer_export_fd", NERTCA_ERROR_ARGUMENT, "fd", unsafe {
             nertca_buffer_export_fd(buffer, null_mut(), null_mut())
         });
+        b.refuses("nertca_buffer_memory", NERTCA_ERROR_ARGUMENT, "memory_type", unsafe {
+            nertca_buffer_memory(buffer, null_mut(), &mut 0)
+        });
+        b.refuses("nertca_buffer_memory", NERTCA_ERROR_ARGUMENT, "bytes", unsafe {
+            nertca_buffer_memory(buffer, &mut 0, null_mut())
+        });
         ok(nertca_buffer_destroy(buffer), buffer);
     } else {
         println!("this device exports no memory: {}", last_error(b.context));
@@ -705,6 +711,7 @@ fn buffers(b: &Bench) {
     b.handles("nertca_buffer_export_fd", buffer, b.context.cast(), |h| unsafe {
         nertca_buffer_export_fd(h, &mut 0, null_mut())
     });
+    b.handles("nertca_buffer_memory", buffer, b.context.cast(), |h| unsafe { nertca_buffer_memory(h, &mut 0, &mut 0) });
     b.handles("nertca_buffer_destroy", buffer, b.context.cast(), |h| nertca_buffer_destroy(h));
     ok(nertca_buffer_destroy(null_mut()), null::<c_void>());
 }

@@ -122,13 +122,13 @@ impl Gpu {
         Ok(())
     }
 
-    /// Makes a device buffer whose memory other processes and APIs can import, as an opaque file descriptor of
-    /// [`Buffer::bytes`] bytes at offset 0. The caller must close the descriptor or pass it to an import.
+    /// Makes a device buffer whose memory other processes and APIs can import, as an opaque file descriptor; the buffer begins
+    /// at offset 0.
     ///
     /// # Errors
     /// [`Error::NoDevice`] where `VK_KHR_external_memory_fd` is missing; [`Error::OutOfMemory`].
     #[cfg(unix)]
-    pub fn exported_buffer(&self, name: &str, bytes: u64) -> Result<(Buffer, std::os::fd::OwnedFd)> {
+    pub fn exported_buffer(&self, name: &str, bytes: u64) -> Result<(Buffer, ExportedMemory)> {
         let info = self.info();
         if !info.external_memory_fd {
             return Err(Error::NoDevice(format!(
@@ -143,10 +143,21 @@ impl Gpu {
             | vk::BufferUsageFlags::TRANSFER_DST;
         let mut inner = Inner::new(&self.shared, name, bytes)?;
         inner.create(&vk::BufferCreateInfo::default().size(bytes).usage(usage).push_next(&mut external))?;
-        let memory = inner.allocate_exportable()?;
-        let fd = inner.export(memory)?;
-        Ok((Buffer { inner: Arc::new(inner) }, fd))
+        let (memory, memory_type, allocated_bytes) = inner.allocate_exportable()?;
+        let descriptor = inner.export(memory)?;
+        Ok((Buffer { inner: Arc::new(inner) }, ExportedMemory { descriptor, memory_type, allocated_bytes }))
     }
+}
+
+/// Memory of a buffer for import by others. It is dedicated to the buffer; a Vulkan device imports it with the same type and size.
+#[cfg(unix)]
+pub struct ExportedMemory {
+    /// Opaque file descriptor.
+    pub descriptor: std::os::fd::OwnedFd,
+    /// Index of its type among the memory types of the physical device.
+    pub memory_type: u32,
+    /// Size of the allocation, bytes, which may exceed the buffer's.
+    pub allocated_bytes: u64,
 }
 
 /// Handle type of exported memory.
@@ -226,15 +237,17 @@ impl Inner {
         Ok(())
     }
 
+    /// Allocates the buffer's memory for export; returns it with the index of its type and its size in bytes.
     #[cfg(unix)]
-    fn allocate_exportable(&mut self) -> Result<vk::DeviceMemory> {
+    fn allocate_exportable(&mut self) -> Result<(vk::DeviceMemory, u32, u64)> {
         let (gpu, requirements) = (&self.gpu, self.requirements());
         // SAFETY: the physical device is the one this device was made from.
         let memories = unsafe { gpu.device.instance.get_physical_device_memory_properties(gpu.physical) };
         let kind = (0..memories.memory_type_count)
             .filter(|i| requirements.memory_type_bits >> i & 1 == 1)
-            .max_by_key(|i| {
-                memories.memory_types[*i as usize].property_flags.contains(vk::MemoryPropertyFlags::DEVICE_LOCAL)
+            // The first type of the device's own memory; types that the host reaches as well come later, and may be small.
+            .min_by_key(|i| {
+                !memories.memory_types[*i as usize].property_flags.contains(vk::MemoryPropertyFlags::DEVICE_LOCAL)
             })
             .ok_or_else(|| {
                 Error::NoDevice(format!("{}: the device has no memory that can be exported", gpu.info.name))
@@ -251,7 +264,7 @@ impl Inner {
             .map_err(Error::vulkan("vkAllocateMemory", &self.name))?;
         self.backing = Backing::Own(memory);
         self.bind(memory, 0)?;
-        Ok(memory)
+        Ok((memory, kind, requirements.size))
     }
 
     #[cfg(unix)]

@@ -16,6 +16,7 @@ LEFT_OUT = {
     "nertca_reconstruction_sample_buffer",
     "nertca_buffer_create",
     "nertca_buffer_export_fd",
+    "nertca_buffer_memory",
     "nertca_buffer_destroy",
     "nertca_semaphore_create",
     "nertca_semaphore_export_fd",
