@@ -361,6 +361,7 @@ impl Gpu {
     pub fn open(options: &DeviceOptions) -> Result<Gpu> {
         let instance = Instance::create(options.loader, options.validation)?;
         let (physical, mut info) = choose(instance.devices()?, options.select.as_deref())?;
+        instance.check_validation(&info)?;
         if options.without_subgroups {
             (info.full_subgroups, info.small_subgroups) = (None, None);
         }

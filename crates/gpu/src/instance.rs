@@ -41,6 +41,8 @@ pub(super) struct Instance {
     messenger: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
     /// Messages of the validation layer; boxed because the messenger keeps their address.
     messages: Box<Mutex<Vec<String>>>,
+    /// Version of Vulkan that the validation layer was made for, where it is on.
+    validation_version: Option<u32>,
     /// Keeps the loader's library in memory.
     entry: ash::Entry,
 }
@@ -102,17 +104,39 @@ fn lists_portability_drivers(entry: &ash::Entry) -> Result<bool> {
     Ok(found.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == khr::portability_enumeration::NAME)))
 }
 
-fn require_validation_layer(entry: &ash::Entry) -> Result<()> {
+/// Returns the version of Vulkan that the installed validation layer was made for.
+fn validation_layer(entry: &ash::Entry) -> Result<u32> {
     // SAFETY: needs nothing but a loader, which `entry` keeps loaded.
     let found = unsafe { entry.enumerate_instance_layer_properties() }
         .map_err(Error::vulkan("vkEnumerateInstanceLayerProperties", "loader"))?;
-    if found.iter().any(|l| l.layer_name_as_c_str().is_ok_and(|n| n == VALIDATION_LAYER)) {
-        return Ok(());
+    let layer = found.iter().find(|l| l.layer_name_as_c_str().is_ok_and(|n| n == VALIDATION_LAYER));
+    layer.map(|l| l.spec_version).ok_or_else(|| {
+        Error::NoDevice(
+            "validation was requested, but VK_LAYER_KHRONOS_validation is not installed (Debian: vulkan-validationlayers)"
+                .into(),
+        )
+    })
+}
+
+fn check_layer(version: Option<u32>, device: &str, has_matrices: bool) -> Result<()> {
+    /// First version that has `VK_KHR_cooperative_matrix`.
+    const MATRICES: u32 = vk::make_api_version(0, 1, 3, 255);
+    match version {
+        Some(version) if version < MATRICES && has_matrices => Err(Error::NoDevice(format!(
+            "{device}: validation was requested, but the validation layer is of Vulkan {}, which is older than the cooperative \
+             matrices of this device: install one of Vulkan {} or later",
+            version_text(version),
+            version_text(MATRICES)
+        ))),
+        _ => Ok(()),
     }
-    Err(Error::NoDevice(
-        "validation was requested, but VK_LAYER_KHRONOS_validation is not installed (Debian: vulkan-validationlayers)"
-            .into(),
-    ))
+}
+
+/// Formats a version, as 1.3.255.
+fn version_text(version: u32) -> String {
+    let [major, minor, patch] =
+        [vk::api_version_major(version), vk::api_version_minor(version), vk::api_version_patch(version)];
+    format!("{major}.{minor}.{patch}")
 }
 
 impl Instance {
@@ -130,8 +154,9 @@ impl Instance {
             extensions.push(khr::portability_enumeration::NAME.as_ptr());
             flags |= vk::InstanceCreateFlags::ENUMERATE_PORTABILITY_KHR;
         }
+        let mut validation_version = None;
         if validation {
-            require_validation_layer(&entry)?;
+            validation_version = Some(validation_layer(&entry)?);
             layers.push(VALIDATION_LAYER.as_ptr());
             extensions.push(ext::debug_utils::NAME.as_ptr());
         }
@@ -147,7 +172,8 @@ impl Instance {
         }
         // SAFETY: `create` and all it points to are locals of this function, alive until the call returns.
         let raw = unsafe { entry.create_instance(&create, None) }.map_err(no_instance)?;
-        let mut instance = Instance { raw, ours: true, messenger: None, messages: Box::default(), entry };
+        let mut instance =
+            Instance { raw, ours: true, messenger: None, messages: Box::default(), validation_version, entry };
         if validation {
             instance.listen()?;
         }
@@ -162,7 +188,7 @@ impl Instance {
         let entry = load(loader)?;
         // SAFETY: the caller vouches for the handle and that it is this loader's.
         let raw = unsafe { ash::Instance::load(entry.static_fn(), raw) };
-        Ok(Instance { raw, ours: false, messenger: None, messages: Box::default(), entry })
+        Ok(Instance { raw, ours: false, messenger: None, messages: Box::default(), validation_version: None, entry })
     }
 
     fn listen(&mut self) -> Result<()> {
@@ -187,6 +213,15 @@ impl Instance {
     /// Tells whether objects can be given names that the validation layer uses.
     pub fn has_debug_names(&self) -> bool {
         self.messenger.is_some()
+    }
+
+    /// Checks that the validation layer, if it is on, knows all that we use of a device. An older layer calls what it does not know
+    /// an error.
+    ///
+    /// # Errors
+    /// [`Error::NoDevice`].
+    pub fn check_validation(&self, info: &DeviceInfo) -> Result<()> {
+        check_layer(self.validation_version, &info.name, !info.matrices.is_empty())
     }
 
     /// Returns the validation layer's errors and warnings so far.
@@ -240,4 +275,20 @@ unsafe extern "system" fn on_message(
     tracing::error!(target: "vulkan", "{text}");
     lock(sink).push(text);
     vk::FALSE
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_validation_layer_older_than_what_is_used_is_refused() {
+        let old = vk::make_api_version(0, 1, 3, 239);
+        let refused = check_layer(Some(old), "card", true).unwrap_err().to_string();
+        assert!(refused.contains("card: ") && refused.contains("1.3.239") && refused.contains("1.3.255"), "{refused}");
+        let new = vk::make_api_version(0, 1, 4, 309);
+        for (version, has_matrices) in [(Some(old), false), (Some(new), true), (None, true)] {
+            check_layer(version, "card", has_matrices).unwrap();
+        }
+    }
 }
