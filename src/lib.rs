@@ -120,6 +120,7 @@ pub mod scan {
     pub mod pixels;
     pub mod prior;
     mod reading;
+    pub mod references;
     pub(crate) mod same_view;
     pub mod truth;
     pub mod writer;
@@ -141,6 +142,7 @@ pub mod import {
     pub mod intake;
     pub mod pictures;
     mod reader;
+    mod sources;
     mod stands;
     pub mod stated;
     mod timing;
@@ -221,6 +223,8 @@ pub mod export {
     pub mod dicom;
     pub mod motion;
     #[cfg(feature = "dicom")]
+    pub mod presentation;
+    #[cfg(feature = "dicom")]
     pub mod segmentation;
     pub mod splats;
     #[cfg(feature = "dicom")]
@@ -251,6 +255,8 @@ pub mod trees {
     #[cfg(feature = "dicom")]
     pub mod measurements;
     pub mod next_view;
+    #[cfg(feature = "dicom")]
+    pub mod over_frames;
     mod radii;
     mod refine;
     mod ridges;

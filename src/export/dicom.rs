@@ -1,7 +1,7 @@
 //! Writes rendered views as DICOM: X-ray angiograms (XA Image Storage), marked as derived and not for diagnosis.
 //!
 //! Values are those of a detector that is linear in intensity: 65535 exp(-integral). Readers that support LIN can recover the
-//! line integrals. There are no references to source runs, because a dataset contains none of their UIDs.
+//! line integrals. There are no references to source runs.
 
 use crate::error::{Error, Result};
 use crate::files;

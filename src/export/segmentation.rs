@@ -1,7 +1,7 @@
 //! Writes the vessels of a phase as a DICOM segmentation (Segmentation Storage, PS3.3 A.51): a binary volume in patient coordinates,
 //! marked as derived and not for diagnosis.
 //!
-//! There are no references to source runs, because a dataset contains none of their UIDs.
+//! There are no references to source runs.
 
 use crate::error::{Error, Result};
 use crate::export::dicom::{

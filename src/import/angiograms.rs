@@ -8,6 +8,7 @@ use crate::import::{beats, image_beat};
 use crate::raster::Image;
 use crate::scan::at_rest::{WIDEST_VESSEL_MM, vessel_pixels, without_vessels};
 use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
+use crate::scan::references::ReferencedRun;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
@@ -56,6 +57,8 @@ pub struct ImportOptions {
     pub all_beats: bool,
     /// Depth searched before and behind the isocentre, mm.
     pub depth_half_extent_mm: f64,
+    /// Whether the dataset keeps references to the runs' files, which name the patient (see [`crate::scan::references`]).
+    pub keep_references: bool,
 }
 
 /// An image of a run, ready for training.
@@ -67,11 +70,15 @@ pub struct TakenFrame {
     pub taken: BeatTime,
     /// Line integrals.
     pub image: Image,
+    /// Frames of the run whose mean the image is, from 0.
+    pub frames: Vec<usize>,
 }
 
 /// A run, ready to be written.
 pub(super) struct Prepared {
     pub(super) frames: Vec<TakenFrame>,
+    /// Reference to the run's file; none where it is not to be kept.
+    pub(super) reference: Option<ReferencedRun>,
     pub(super) notes: Vec<String>,
 }
 
@@ -143,10 +150,36 @@ impl Prepared {
             ));
         }
         let images = chosen.phases(options, &mut notes)?;
-        let taken =
-            |(taken, stand, image): (BeatTime, usize, Image)| TakenFrame { c_arm: c_arms[stand].clone(), taken, image };
-        Ok(Prepared { frames: images.into_iter().map(taken).collect(), notes })
+        let taken = |PhaseImage { taken, stand, frames, image }: PhaseImage| TakenFrame {
+            c_arm: c_arms[stand].clone(),
+            taken,
+            image,
+            frames,
+        };
+        let reference = match &run.source {
+            _ if !options.keep_references => None,
+            Some(source) => Some(ReferencedRun {
+                source: source.clone(),
+                first_px: [columns.start, rows.start],
+                pixels_per_pixel: factor,
+            }),
+            None => {
+                let problem = "are missing or are no UIDs, so that no references to this file can be kept";
+                return Err(Error::data(&run.path, "UIDs of study, series, class and image", problem));
+            }
+        };
+        Ok(Prepared { frames: images.into_iter().map(taken).collect(), reference, notes })
     }
+}
+
+/// Image of a phase.
+struct PhaseImage {
+    taken: BeatTime,
+    /// Index of the first frame with its pose.
+    stand: usize,
+    /// Frames whose mean it is, from 0.
+    frames: Vec<usize>,
+    image: Image,
 }
 
 /// Selected frames of a run.
@@ -168,8 +201,8 @@ impl Chosen<'_> {
         frames.iter().map(|frame| self.stands[*frame]).collect()
     }
 
-    /// Averages the frames of each phase and pose. Returns their times in the beat, their poses and the mean images.
-    fn phases(&self, options: &ImportOptions, notes: &mut Vec<String>) -> Result<Vec<(BeatTime, usize, Image)>> {
+    /// Averages the frames of each phase and pose.
+    fn phases(&self, options: &ImportOptions, notes: &mut Vec<String>) -> Result<Vec<PhaseImage>> {
         let (run, selected, n_phases) = (self.run, self.selected, options.phases);
         let none = |problem: &str| Error::data(&run.path, "phases", problem.to_owned());
         let from =
@@ -184,9 +217,16 @@ impl Chosen<'_> {
                     selected.len()
                 ));
                 let of_stand = |stand: usize| {
-                    let mean = mean(self.frames, &from(stand, selected));
+                    let frames = from(stand, selected);
+                    let mean = mean(self.frames, &frames);
                     let background = without_vessels(&mean, self.vessel, DARK);
-                    [(BeatTime::at_phase(0), stand, mean), (BeatTime::at_phase(1), stand, background)]
+                    let image = |phase: u32, image: Image| PhaseImage {
+                        taken: BeatTime::at_phase(phase),
+                        stand,
+                        frames: frames.clone(),
+                        image,
+                    };
+                    [image(0, mean), image(1, background)]
                 };
                 return Ok(self.stands_of(selected).into_iter().flat_map(of_stand).collect());
             }
@@ -223,7 +263,8 @@ impl Chosen<'_> {
                 // A phase may have several frames, also of several beats where those are averaged.
                 let frames = from(stand, &frames);
                 let after_phase = frames.iter().map(|i| of_phase[i].after_phase).sum::<f64>() / frames.len() as f64;
-                images.push((BeatTime { phase, after_phase }, stand, mean(self.frames, &frames)));
+                let image = mean(self.frames, &frames);
+                images.push(PhaseImage { taken: BeatTime { phase, after_phase }, stand, frames, image });
             }
         }
         if seen < 2 {

@@ -11,6 +11,7 @@ use crate::import::reader::Reader;
 use crate::import::stated::StatedGeometry;
 use crate::import::{timing, traces};
 use crate::scan::gating::RPeaks;
+use crate::scan::references::SourceImage;
 use dicom_core::{Tag, VR};
 use dicom_dictionary_std::tags;
 use std::ops::Range;
@@ -62,6 +63,8 @@ pub struct Run {
     pub identity: [u64; 2],
     /// Hash of the instance, which is equal for copies of a run; none if the file does not state it.
     pub instance: Option<u64>,
+    /// Identity of the file, where it has all UIDs; kept in memory only, unless an import is asked to keep references.
+    pub source: Option<SourceImage>,
     /// Notes on assumptions and on unusual content.
     pub notes: Vec<String>,
 }
@@ -229,6 +232,7 @@ impl Run {
             burnt_in: r.text(tags::BURNED_IN_ANNOTATION).is_some_and(|t| t.eq_ignore_ascii_case("YES")),
             identity,
             instance,
+            source: r.source([width, height]),
             notes,
         })
     }

@@ -10,6 +10,7 @@ use crate::scan::at_rest;
 use crate::scan::canvas::in_words;
 use crate::scan::dataset::{Layout, Split};
 use crate::scan::frame_checks::{check_values, checked_view};
+use crate::scan::references::{REFERENCES, ReferencedImage, ReferencedRun, References};
 use crate::scan::same_view::find_or_add;
 use crate::scan::writer::{About, Writer};
 use rayon::prelude::*;
@@ -171,7 +172,11 @@ impl Intake {
         };
         let mut writer = Writer::new(out, Layout::Native, about)?;
         let (mut views, mut sizes) = (Vec::new(), Vec::new());
-        for TakenFrame { c_arm, taken, image } in self.runs.iter().take(runs).flat_map(|run| &run.frames) {
+        let mut referenced = Vec::new();
+        let numbered = self.runs.iter().take(runs).enumerate();
+        for (run, TakenFrame { c_arm, taken, image, frames }) in
+            numbered.flat_map(|(number, run)| run.frames.iter().map(move |frame| (number, frame)))
+        {
             let size = [image.width, image.height];
             if !sizes.contains(&size) {
                 sizes.push(size);
@@ -181,7 +186,14 @@ impl Intake {
             let depth_before = self.options.depth_half_extent_mm / MM_PER_UNIT;
             let view = find_or_add(&mut views, geometry.clone(), size, depth_before)
                 .map_err(|found| Error::config(found.field, found.value, found.problem))?;
-            writer.frame(&geometry, Split::Train, view, *taken, image, None)?;
+            let file = writer.frame(&geometry, Split::Train, view, *taken, image, None)?;
+            let frames = frames.iter().map(|frame| *frame as u32 + 1).collect();
+            referenced.push(ReferencedImage { image: file, run, frames });
+        }
+        // Runs of one intake have references all or none.
+        let sources: Vec<ReferencedRun> = self.runs.iter().take(runs).filter_map(|run| run.reference.clone()).collect();
+        if sources.len() == runs {
+            References::new(sources, referenced).write(out)?;
         }
         writer.finish()?;
         let times = if self.is_still() { "at rest".to_owned() } else { format!("at {} phases", self.phases()) };
@@ -284,5 +296,12 @@ fn write_runs(runs: Vec<Run>, gatings: &[Option<Gating>], options: &ImportOption
     let mut intake = Intake::new(options.clone());
     let mut notes = intake.take_gated(runs, gatings)?;
     notes.push(intake.write(out)?);
+    if options.keep_references {
+        notes.push(format!(
+            "{REFERENCES} keeps, for results that an archive can file with the runs: name, identifier, birth date and sex of the patient, \
+             date, time, identifier, accession number and referring physician of the study, the UIDs of study, series and images, and \
+             the numbers of the frames. Delete it before the dataset is passed on"
+        ));
+    }
     Ok(notes)
 }

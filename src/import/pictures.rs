@@ -144,6 +144,7 @@ pub fn read(view: &PictureView, meaning: &PixelMeaning) -> Result<Run> {
         open: (0..width, 0..height),
         burnt_in: meaning.burnt_in_text,
         identity: [0; 2],
+        source: None,
         instance: None,
         notes,
     })

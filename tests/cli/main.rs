@@ -37,6 +37,7 @@ mod motion;
 mod moving_runs;
 mod network_runs;
 mod positions;
+mod presentation;
 mod prior;
 mod run_directories;
 mod selftest;

@@ -40,6 +40,7 @@ fn options(gating: Gating, phases: u32) -> ImportOptions {
         size: None,
         all_beats: false,
         depth_half_extent_mm: 90.0,
+        keep_references: false,
     }
 }
 

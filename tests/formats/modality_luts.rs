@@ -80,6 +80,7 @@ fn integrals(file: &Path, directory: &Path) -> Vec<f32> {
         size: None,
         all_beats: false,
         depth_half_extent_mm: 90.0,
+        keep_references: false,
     };
     let out = directory.join("data");
     let _ = std::fs::remove_dir_all(&out);

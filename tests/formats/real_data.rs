@@ -30,6 +30,7 @@ fn options() -> ImportOptions {
         size: Some(256),
         all_beats: false,
         depth_half_extent_mm: 100.0,
+        keep_references: false,
     }
 }
 

@@ -9,6 +9,7 @@ use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::formats::volume::VolumeHints;
+use nertca_vk::import::angiograms::ImportOptions;
 use nertca_vk::import::intake::import_dicom_as_stated;
 use nertca_vk::phantom::dataset::{Anatomy, PhantomOptions, VolumeOptions, make, project_volumes};
 use nertca_vk::phantom::degradations::Degradations;
@@ -44,6 +45,10 @@ pub struct ImportDicomArgs {
     /// Replace a dataset that the directory already contains.
     #[arg(short, long)]
     pub force: bool,
+    /// Keep references to the files in `references.json` of the dataset, so that results can be filed with them (`tree --presentation`):
+    /// UIDs and frame numbers, name and identifier of the patient, date of the study. By default, the dataset knows nothing of this.
+    #[arg(long)]
+    pub keep_references: bool,
     /// Options of reading runs.
     #[command(flatten)]
     pub reading: DicomArgs,
@@ -142,7 +147,7 @@ pub fn import(args: &ImportArgs) -> Result<()> {
 }
 
 fn dicom(args: &ImportDicomArgs) -> Result<()> {
-    let options = args.reading.options()?;
+    let options = ImportOptions { keep_references: args.keep_references, ..args.reading.options()? };
     let stated = args.reading.stated(args.files.len())?;
     let import = |out: &Path| import_dicom_as_stated(&args.files, &stated, &options, out);
     let notes = write_dataset(&args.out, args.force, import)?;

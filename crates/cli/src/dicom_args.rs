@@ -113,6 +113,7 @@ impl RunArgs {
             size: self.size,
             all_beats: self.all_beats,
             depth_half_extent_mm: self.depth,
+            keep_references: false,
         })
     }
 

@@ -9,6 +9,7 @@ use nertca_vk::fingerprint::Fingerprint;
 use nertca_vk::phantom::tree_file::TREE;
 use nertca_vk::scan::dataset::MANIFEST;
 use nertca_vk::scan::nerfca;
+use nertca_vk::scan::references::REFERENCES;
 use nertca_vk::scan::truth::TRUTH;
 use nertca_vk::score::volume::VOLUMES;
 use std::ffi::OsStr;
@@ -26,6 +27,7 @@ const ALWAYS_NAMED: &[(&str, &str)] = &[
     ("", nerfca::TRAINING_LIST),
     ("", nerfca::VALIDATION_LIST),
     ("", TRUTH),
+    ("", REFERENCES),
     (VOLUMES, TREE),
     (CALIBRATION, correction::FILE),
 ];

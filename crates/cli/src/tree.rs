@@ -8,6 +8,7 @@ use clap::Args;
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::checkpoint::newest_model;
 use nertca_vk::error::{Error, Result};
+use nertca_vk::export::presentation::PresentationSeeds;
 use nertca_vk::export::structured::ReportSeeds;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::model::Model;
@@ -17,12 +18,14 @@ use nertca_vk::run::info::RunInfo;
 use nertca_vk::run::score::as_trained;
 use nertca_vk::run::tree_score::score_tree;
 use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::scan::references::{REFERENCES, References};
 use nertca_vk::score::eval::Evaluation;
 use nertca_vk::trees::doubt::state_doubt;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
 use nertca_vk::trees::lesions::{Lesion, lesions};
 use nertca_vk::trees::measurements;
+use nertca_vk::trees::over_frames;
 use nertca_vk::trees::tree::{BeatTree, CONFIDENCE, DOUBTFUL, TreeView};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -45,6 +48,10 @@ pub struct TreeArgs {
     /// omitted. By default three times the field's resolution.
     #[arg(long, value_name = "MM")]
     pub min_branch: Option<f64>,
+    /// Write the centrelines over the frames of the source runs as a DICOM presentation state, which names the patient: --out ends in
+    /// .dcm. The dataset must have been made by `import dicom --keep-references`.
+    #[arg(long)]
+    pub presentation: bool,
     /// Replace the files of an earlier series (`NAME_0000.EXT` and so on), all of them.
     #[arg(short, long)]
     pub force: bool,
@@ -192,13 +199,23 @@ enum Output {
     Tree(TreeFormat),
     /// DICOM structured report.
     Measurements,
+    /// DICOM presentation state.
+    Presentation,
 }
 
 impl Output {
-    /// Returns the kind by the extension of a file name.
-    fn of(path: &Path) -> Option<Output> {
-        let is_dicom = path.extension().is_some_and(|end| end.eq_ignore_ascii_case("dcm"));
-        if is_dicom { Some(Output::Measurements) } else { TreeFormat::of(path).map(Output::Tree) }
+    /// Returns the kind by the extension of --out, and by --presentation.
+    fn of(args: &TreeArgs) -> Result<Output> {
+        let is_dicom = args.out.extension().is_some_and(|end| end.eq_ignore_ascii_case("dcm"));
+        let unknown = |known| Error::config("--out", args.out.display(), format!("does not end in {known}"));
+        match (is_dicom, args.presentation) {
+            (true, true) => Ok(Output::Presentation),
+            (true, false) => Ok(Output::Measurements),
+            (false, true) => Err(unknown(".dcm, as a presentation state must")),
+            (false, false) => {
+                TreeFormat::of(&args.out).map(Output::Tree).ok_or_else(|| unknown("one of .json .vtp .swc .glb .dcm"))
+            }
+        }
     }
 }
 
@@ -210,10 +227,36 @@ fn write_measurements(beat: &BeatTree, args: &TreeArgs) -> Result<Vec<PathBuf>> 
     Ok(vec![args.out.clone()])
 }
 
+/// References of a dataset to the runs from which it was imported.
+struct Sources {
+    dataset: Dataset,
+    references: References,
+}
+
+impl Sources {
+    /// Reads the references of the dataset of a run.
+    fn of(run: &Path) -> Result<Sources> {
+        let dataset = dataset_of(run)?;
+        let references = References::read(&dataset.path)?.ok_or_else(|| {
+            let problem = "is missing: a presentation state needs references to the frames of the runs; import them again with \
+                           --keep-references";
+            Error::data(dataset.path.join(REFERENCES), "file", problem)
+        })?;
+        Ok(Sources { dataset, references })
+    }
+
+    /// Writes the centrelines of a tree over the frames of the runs and returns the file.
+    fn write_presentation(&self, beat: &BeatTree, out: &Path) -> Result<Vec<PathBuf>> {
+        let [series, instance] = random_numbers()?;
+        over_frames::write(beat, &self.dataset, &self.references, out, &PresentationSeeds { series, instance })?;
+        Ok(vec![out.to_owned()])
+    }
+}
+
 /// Finds the vessels of a run as trees and writes them.
 pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
-    let unknown = || Error::config("--out", args.out.display(), "does not end in one of .json .vtp .swc .glb .dcm");
-    let format = Output::of(&args.out).ok_or_else(unknown)?;
+    let format = Output::of(args)?;
+    let sources = if format == Output::Presentation { Some(Sources::of(&args.run)?) } else { None };
     let model = newest_model(&args.run)?;
     let (phases, all) = phases(&args.phase, &model)?;
     let several = all && matches!(format, Output::Tree(TreeFormat::Vtp | TreeFormat::Swc));
@@ -223,9 +266,10 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     // Ctrl-C may end the program at once, because no partial result has been written here.
     let mut beat = find(global, &gpu, &model, &AtomicBool::new(false), &options)?;
     compare_with_run(&mut beat, &args.run);
-    let made = match format {
-        Output::Tree(format) => write(&beat, &args.out, format, all)?,
-        Output::Measurements => write_measurements(&beat, args)?,
+    let made = match (&sources, format) {
+        (Some(sources), _) => sources.write_presentation(&beat, &args.out)?,
+        (None, Output::Tree(format)) => write(&beat, &args.out, format, all)?,
+        (None, _) => write_measurements(&beat, args)?,
     };
     earlier.make_way(&made)?;
     made.iter().for_each(|path| out!("{}", path.display()));
