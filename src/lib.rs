@@ -121,6 +121,7 @@ pub mod scan {
     pub mod prior;
     mod reading;
     pub mod references;
+    pub mod rtk;
     pub(crate) mod same_view;
     pub mod truth;
     pub mod writer;

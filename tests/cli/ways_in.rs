@@ -476,3 +476,27 @@ fn variables_that_hide_drivers_are_named() {
         assert!(said.contains(&format!("{variable}={value}")) && said.contains("hides"), "{said}");
     }
 }
+
+#[test]
+fn projections_of_rtk_are_imported() {
+    let directory = tempfile::tempdir().unwrap();
+    let at = |name: &str| directory.path().join(name);
+    let [geometry, stack] =
+        ["geometry.xml", "projections.mha"].map(|name| crate::root::root().join("tests/formats/rtk").join(name));
+    std::fs::write(at("phases.txt"), "0\n0.5 # between two phases\n1\n2\n").unwrap();
+    let import = ["import", "rtk", text(&geometry), text(&stack), "--phases", "3", "-o"];
+    let (data, still) = (at("data"), at("still"));
+    ok(&[&import[..], &[text(&data), "--phase-list", text(&at("phases.txt"))]].concat());
+    let written = manifest(&data);
+    assert_eq!(written["phases"], 3);
+    let phases: Vec<&Value> = written["frames"].as_array().unwrap().iter().map(|frame| &frame["phase"]).collect();
+    assert_eq!(phases, [&json!(0), &json!(0.5), &json!(1), &json!(2)]);
+    assert!(written["frames"][3]["geometry"]["matrix"].is_array());
+    ok(&[&import[..], &[text(&still), "--still"]].concat());
+    assert_eq!((Dataset::open(&still).unwrap().still, Dataset::open(&still).unwrap().views.len()), (true, 4));
+    fails(&[&import[..], &[text(&at("none"))]].concat(), 2, &["--phase-list", "--still"]);
+    fails(&[&import[..], &[text(&still), "--still"]].concat(), 2, &["already contains a dataset", "--force"]);
+    let none = at("none");
+    let swapped = ["import", "rtk", text(&stack), text(&geometry), "--still", "-o", text(&none)];
+    fails(&swapped, 2, &["PROJECTIONS", ".mha"]);
+}

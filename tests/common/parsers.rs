@@ -46,6 +46,12 @@ pub const PARSERS: &[Parser] = &[
         seeds: || vec![VIEWS.as_bytes().to_vec()],
         parse: |p| nertca_vk::import::views_file::read(p).is_ok(),
     },
+    Parser {
+        name: "rtk",
+        file: "geometry.xml",
+        seeds: || vec![include_bytes!("../formats/rtk/geometry.xml").to_vec()],
+        parse: |p| nertca_vk::formats::rtk::read_geometry(p).is_ok(),
+    },
     Parser { name: "vtp", file: "t.vtp", seeds: vtp_trees, parse: reads_tree },
     Parser { name: "tree_json", file: "t.json", seeds: json_trees, parse: reads_tree },
     Parser { name: "manifest", file: "dataset.json", seeds: || vec![manifest(&NATIVE)], parse: |p| opens(&NATIVE, p) },

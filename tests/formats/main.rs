@@ -33,5 +33,6 @@ mod nerfca;
 #[cfg(feature = "dicom")]
 mod pydicom;
 mod real_data;
+mod rtk;
 mod same_view;
 mod units_and_spaces;

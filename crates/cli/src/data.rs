@@ -4,6 +4,7 @@ use super::dicom_args::DicomArgs;
 use super::options::GlobalOptions;
 use super::output::write_dataset;
 use super::picture_args::{self, ImportPicturesArgs};
+use super::rtk_args::{self, ImportRtkArgs};
 use super::synthetic_args::{PhantomArgs, ProjectArgs};
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -31,6 +32,8 @@ pub enum ImportSource {
     Dicom(ImportDicomArgs),
     /// X-ray angiography runs as pictures (PNG, JPEG, TIFF), one folder of frames per view, with a geometry by options.
     Pictures(ImportPicturesArgs),
+    /// Projections with a geometry of the Reconstruction Toolkit (RTK): one stack, and a matrix for each projection.
+    Rtk(ImportRtkArgs),
 }
 
 /// Arguments of `import dicom`.
@@ -143,6 +146,7 @@ pub fn import(args: &ImportArgs) -> Result<()> {
     match &args.source {
         ImportSource::Dicom(args) => dicom(args),
         ImportSource::Pictures(args) => picture_args::run(args),
+        ImportSource::Rtk(args) => rtk_args::run(args),
     }
 }
 

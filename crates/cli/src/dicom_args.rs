@@ -173,7 +173,7 @@ fn frame_range(text: &str) -> std::result::Result<std::ops::RangeInclusive<usize
 }
 
 /// Reads one value per line; text after a `#` is ignored.
-fn list<T: std::str::FromStr>(path: &Path) -> Result<Vec<T>> {
+pub(super) fn list<T: std::str::FromStr>(path: &Path) -> Result<Vec<T>> {
     let text = files::read_text(path, MAX_LIST_BYTES)?;
     let lines = text.lines().map(|l| l.split('#').next().unwrap_or_default().trim()).enumerate();
     lines

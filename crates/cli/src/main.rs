@@ -44,6 +44,7 @@ mod plot;
 mod progress;
 mod render;
 mod report;
+mod rtk_args;
 mod score_table;
 mod selftest;
 mod stdout;

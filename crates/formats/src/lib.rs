@@ -27,6 +27,7 @@ pub mod nrrd;
 pub mod png;
 pub mod raster;
 pub mod raw;
+pub mod rtk;
 pub mod splats;
 pub mod swc;
 pub mod volume;
