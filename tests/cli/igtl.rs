@@ -42,6 +42,19 @@ fn axis(c_arm: &CArm) -> [f64; 3] {
     [-secondary.cos() * primary.sin(), secondary.cos() * primary.cos(), secondary.sin()]
 }
 
+/// The module of 3D Slicer asks for the names that are sent; stand-ins take the place of Slicer.
+#[test]
+fn the_module_of_slicer_connects_and_shows() {
+    let root = crate::root::root();
+    let outcome = python()
+        .arg(root.join("tests/python/check_slicer_module.py"))
+        .arg(root.join("examples/slicer/NertcaLive/NertcaLive.py"))
+        .output()
+        .unwrap();
+    print!("{}", String::from_utf8_lossy(&outcome.stdout));
+    assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
+}
+
 #[test]
 fn clients_get_the_overlay_its_place_and_the_vessels() {
     let directory = tempfile::tempdir().unwrap();
