@@ -344,6 +344,7 @@ mod tests {
             spacing_mm: 1.0,
             views: Vec::new(),
             phases,
+            measured_mm: Vec::new(),
         }
     }
 

@@ -34,6 +34,8 @@ const RESOLVED_DEVIATIONS: f64 = 2.5;
 const MIN_BRANCH: f64 = 3.0;
 /// Number of times that lines are moved to the ridge.
 const CENTRINGS: usize = 2;
+/// Distance from a centreline to which the field is sampled for its profiles, in units of the vessel's radius.
+const PROFILE_REACH: f64 = 2.5;
 
 /// Options of the extraction of trees.
 #[derive(Debug, Clone, PartialEq)]
@@ -67,12 +69,14 @@ pub fn vessel_trees(
     progress(0, all)?;
     let mut finder = Finder::new(renderer, model, options)?;
     let deformable = model.gaussians.as_ref().and_then(DynamicGaussians::deformable);
-    let mut phases = Vec::new();
+    let (mut phases, mut measured_mm) = (Vec::new(), Vec::new());
     if let Some(tree) = deformable {
         let reference = finder.tree(tree.setup.rest_phase)?;
         let carrier = Carrier::new(tree);
         for phase in &options.phases {
-            phases.push(finder.followed(&reference, &carrier, *phase)?);
+            let (tree, radii_mm) = finder.followed(&reference, &carrier, *phase)?;
+            phases.push(tree);
+            measured_mm.push(radii_mm);
             progress(phases.len() as u64, all)?;
         }
     } else {
@@ -88,6 +92,7 @@ pub fn vessel_trees(
         spacing_mm: finder.spacing_mm,
         views: Vec::new(),
         phases,
+        measured_mm,
     })
 }
 
@@ -182,15 +187,25 @@ impl Finder<'_> {
         self.model.vessel_attenuation.map(|attenuation| attenuation / MM_PER_UNIT)
     }
 
-    /// Moves the tree of the reference phase to another phase. A material point keeps its radius.
-    fn followed(&mut self, reference: &PhaseTree, carrier: &Carrier<'_>, phase: u32) -> Result<PhaseTree> {
+    /// Moves the tree of the reference phase to another phase, where a material point keeps its radius. Returns also the radii of the branches
+    /// as the field of the phase has them, mm.
+    fn followed(
+        &mut self,
+        reference: &PhaseTree,
+        carrier: &Carrier<'_>,
+        phase: u32,
+    ) -> Result<(PhaseTree, Vec<Vec<f64>>)> {
         if phase == reference.phase {
-            return Ok(reference.clone());
+            let radii_mm = reference.branches.iter().map(|branch| branch.radius_mm.clone()).collect();
+            return Ok((reference.clone(), radii_mm));
         }
         let carried: Vec<Vec<DVec3>> =
             reference.branches.iter().map(|branch| carrier.carried_mm(&branch.points_mm, phase)).collect();
-        let reach_mm = Centring::REACH * self.resolution_mm;
-        let boxes: Vec<Corners> = carried.iter().flatten().map(|point| Corners::around(*point, reach_mm)).collect();
+        let around = |(branch, line): (&Branch, &Vec<DVec3>)| -> Vec<Corners> {
+            let reach_mm = |radius_mm: f64| (Centring::REACH * self.resolution_mm).max(PROFILE_REACH * radius_mm);
+            line.iter().zip(&branch.radius_mm).map(|(point, r)| Corners::around(*point, reach_mm(*r))).collect()
+        };
+        let boxes: Vec<Corners> = reference.branches.iter().zip(&carried).flat_map(around).collect();
         let field = self.field(phase, &boxes)?.ok_or_else(|| self.no_vessels(phase))?;
         let centring = Centring { field: &field, resolution_mm: self.resolution_mm };
         let mut branches: Vec<Branch> = Vec::new();
@@ -200,7 +215,14 @@ impl Finder<'_> {
             let points_mm = centring.line(&points_mm, start.is_some());
             branches.push(Branch { points_mm, ..branch.clone() });
         }
-        Ok(PhaseTree { phase, branches })
+        let lumen = self.lumen(&field);
+        let radii_mm = branches.iter().map(|branch| lumen.radii_mm(&branch.points_mm)).collect();
+        Ok((PhaseTree { phase, branches }, radii_mm))
+    }
+
+    /// Returns the measurement of radii in a field.
+    fn lumen<'a>(&self, field: &'a SampledField) -> Lumen<'a> {
+        Lumen { field, resolution_mm: self.resolution_mm, vessel_per_mm: self.vessel_per_mm() }
     }
 
     /// Returns the share of the other fits that have a vessel at each point; empty for a single fit.
@@ -213,7 +235,7 @@ impl Finder<'_> {
 
     /// Measures the radii of the vessels along lines at a phase, and how far repeated fits agree on them.
     fn measured(&self, field: &SampledField, lines: Vec<Line>, phase: u32) -> Vec<Branch> {
-        let lumen = Lumen { field, resolution_mm: self.resolution_mm, vessel_per_mm: self.vessel_per_mm() };
+        let lumen = self.lumen(field);
         let branch = |Line { parent, points_mm }: Line| {
             let radius_mm = lumen.radii_mm(&points_mm);
             let agreement = self.agreement(&points_mm, phase);

@@ -4,7 +4,7 @@ use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::swc;
 use crate::formats::vtp::{self, Values};
-use crate::trees::lesions::{Lesion, lesions};
+use crate::trees::lesions::{Lesion, lesions, over_beat};
 use crate::trees::sight::TreeInView;
 use crate::trees::tree::{BeatTree, Branch, Doubt, PhaseTree, TreeView};
 use crate::trees::tubes::to_glb;
@@ -77,6 +77,8 @@ struct LesionRow {
     reference_diameter_mm: f64,
     stenosis_percent: f64,
     #[serde(skip_serializing_if = "Vec::is_empty")]
+    over_beat_percent: Vec<f64>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
     views: Vec<SightRow>,
 }
 
@@ -91,7 +93,8 @@ struct SightRow {
 }
 
 impl LesionRow {
-    fn of(lesion: Lesion, tree: &PhaseTree, views: &[(&TreeView, TreeInView)]) -> LesionRow {
+    fn of((lesion, over_beat): (Lesion, Vec<f64>), tree: &PhaseTree, views: &[(&TreeView, TreeInView)]) -> LesionRow {
+        let tenths = |percent: f64| (10.0 * percent).round() / 10.0;
         let sight = |(view, shown): &(&TreeView, TreeInView)| {
             let sight = shown.sight(tree, &lesion.places)?;
             Some(SightRow {
@@ -104,7 +107,8 @@ impl LesionRow {
         };
         LesionRow {
             views: views.iter().filter_map(sight).collect(),
-            stenosis_percent: (10.0 * lesion.percent()).round() / 10.0,
+            stenosis_percent: tenths(lesion.percent()),
+            over_beat_percent: over_beat.into_iter().map(tenths).collect(),
             branch: lesion.branch,
             point: lesion.point,
             from_root_mm: rounded(lesion.from_root_mm),
@@ -250,7 +254,12 @@ pub fn to_json(beat: &BeatTree) -> Result<String> {
             phase: tree.phase,
             length_mm: rounded(tree.length_mm()),
             branches: tree.branches.iter().map(BranchRow::of).collect(),
-            lesions: found.into_iter().map(|lesion| LesionRow::of(lesion, tree, &views)).collect(),
+            lesions: found
+                .iter()
+                .cloned()
+                .zip(over_beat(beat, &found))
+                .map(|lesion| LesionRow::of(lesion, tree, &views))
+                .collect(),
         }
     });
     let file = TreeFile {
@@ -373,6 +382,7 @@ mod tests {
             spacing_mm: 0.25,
             views: Vec::new(),
             phases,
+            measured_mm: Vec::new(),
         }
     }
 

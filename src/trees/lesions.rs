@@ -1,7 +1,7 @@
 //! Stenoses: places where a vessel is narrower than its course elsewhere lets expect.
 
 use crate::linear::Pentadiagonal;
-use crate::trees::tree::PhaseTree;
+use crate::trees::tree::{BeatTree, PhaseTree};
 use glam::DVec3;
 use std::f64::consts::TAU;
 
@@ -71,6 +71,14 @@ pub struct StraightVessel {
     pub lesions: Vec<Lesion>,
 }
 
+impl StraightVessel {
+    /// Returns the narrowings, as shares of the reference diameter, at those of some places that lie in the vessel.
+    fn narrowings(&self, places: &[(usize, usize)]) -> impl Iterator<Item = f64> {
+        let at = |place: &(usize, usize)| self.places.iter().position(|own| own == place);
+        places.iter().filter_map(at).map(|i| 1.0 - self.diameter_mm[i] / self.reference_mm[i])
+    }
+}
+
 /// A vessel that continues through bifurcations, as points of the branches that it consists of.
 struct Course {
     /// Branch and point of each place.
@@ -89,6 +97,29 @@ struct Course {
 /// whose diameter is below nine tenths of the reference, and somewhere [`MIN_PERCENT`] or more below it.
 pub fn lesions(tree: &PhaseTree, resolution_mm: f64) -> Vec<Lesion> {
     straight_vessels(tree, resolution_mm).into_iter().flat_map(|vessel| vessel.lesions).collect()
+}
+
+/// Returns the diameter stenosis of lesions at each phase of a beat, percent, as the field of the phase has it: the worst place of the narrowed
+/// part. Empty where points are not followed, because each phase then has lesions of its own.
+pub fn over_beat(beat: &BeatTree, lesions: &[Lesion]) -> Vec<Vec<f64>> {
+    let mut percents = vec![Vec::new(); lesions.len()];
+    if lesions.is_empty() {
+        return percents;
+    }
+    for (tree, radii_mm) in beat.phases.iter().zip(&beat.measured_mm) {
+        let mut measured = tree.clone();
+        measured
+            .branches
+            .iter_mut()
+            .zip(radii_mm)
+            .for_each(|(branch, radius_mm)| branch.radius_mm.clone_from(radius_mm));
+        let vessels = straight_vessels(&measured, beat.resolution_mm);
+        for (lesion, percents) in lesions.iter().zip(&mut percents) {
+            let narrowings = vessels.iter().flat_map(|vessel| vessel.narrowings(&lesion.places));
+            percents.push(100.0 * narrowings.fold(0.0, f64::max));
+        }
+    }
+    percents
 }
 
 /// Returns the vessels of a tree with their diameters and stenoses, as [`lesions`] judges them; vessels that are too short to be judged are
@@ -307,6 +338,30 @@ mod tests {
         assert!((lesion.length_mm - 0.73 * 12.0).abs() < 2.0 * STEP_MM, "{lesion:?}");
         let blurred = lesions(&tree(vec![vessel]), RESOLUTION_MM);
         assert!(blurred[0].min_diameter_mm < lesion.min_diameter_mm, "{blurred:?}");
+    }
+
+    #[test]
+    fn a_stenosis_has_its_percentage_at_each_phase_of_the_beat() {
+        let with = |share: f64| {
+            tree(vec![branch(None, DVec3::ZERO, DVec3::X, 101, |mm| 1.5 * narrowed(mm, 40.0, 12.0, share))])
+        };
+        let mut beat = BeatTree {
+            reference_phase: Some(0),
+            threshold_per_mm: 1.0,
+            resolution_mm: SHARP_MM,
+            spacing_mm: 0.4,
+            views: Vec::new(),
+            phases: vec![with(0.6); 3],
+            measured_mm: [0.6, 0.5, 0.0].map(|share| vec![with(share).branches[0].radius_mm.clone()]).into(),
+        };
+        let found = lesions(&beat.phases[0], SHARP_MM);
+        let percents = over_beat(&beat, &found);
+        let off = percents[0].iter().zip([60.0, 50.0, 0.0]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        assert!(percents.len() == 1 && percents[0].len() == 3 && off < 3.0, "{percents:?}");
+        assert_eq!(percents[0][0], found[0].percent());
+        beat.measured_mm.clear();
+        assert_eq!(over_beat(&beat, &found), [Vec::<f64>::new()], "each phase has lesions of its own");
+        assert!(over_beat(&beat, &[]).is_empty());
     }
 
     #[test]

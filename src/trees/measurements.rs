@@ -269,6 +269,7 @@ mod tests {
             spacing_mm: 0.5,
             views: Vec::new(),
             phases,
+            measured_mm: Vec::new(),
         }
     }
 

@@ -129,6 +129,18 @@ fn expect_shown_and_reported(directory: &Path) {
     python_test("check_viewer_lesions.py", &[Path::new(&viewer.url), &at("all.json"), &at("viewer.png")]);
 }
 
+/// The stenosis of the phantom does not change, and the fields of the phases show it about as it is.
+fn expect_the_same_over_the_beat(tree: &Path, percent: f64) {
+    let beat: Value = serde_json::from_slice(&std::fs::read(tree).unwrap()).unwrap();
+    let lesion = &beat["phases"][0]["lesions"][0];
+    let percents: Vec<f64> =
+        lesion["over_beat_percent"].as_array().unwrap().iter().map(|value| value.as_f64().unwrap()).collect();
+    assert_eq!(percents.len(), beat["phases"].as_array().unwrap().len());
+    assert_eq!(percents[0], lesion["stenosis_percent"], "points are followed from phase 0");
+    let mean = percents.iter().sum::<f64>() / percents.len() as f64;
+    assert!((mean - percent).abs() < 20.0 && percents[1..] != vec![percents[0]; percents.len() - 1], "{percents:?}");
+}
+
 #[test]
 fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
     let directory = tempfile::tempdir().unwrap();
@@ -149,6 +161,7 @@ fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
     expect_foreshortening(&tree, lesion);
     expect_the_same_in_c(&ill.join("run"), &tree);
     expect_shown_and_reported(&ill);
+    expect_the_same_over_the_beat(&ill.join("all.json"), number(true_lesion, "percent"));
     let scores = lesion_scores(&ill.join("run"));
     let counts = ["true_lesions", "found", "false_lesions", "severe_false_lesions"].map(|field| scores[field].as_u64());
     assert_eq!(counts, [Some(1), Some(1), Some(0), Some(0)], "{scores}");

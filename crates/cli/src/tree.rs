@@ -23,7 +23,7 @@ use nertca_vk::score::eval::Evaluation;
 use nertca_vk::trees::doubt::state_doubt;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
-use nertca_vk::trees::lesions::{Lesion, lesions};
+use nertca_vk::trees::lesions::{Lesion, lesions, over_beat};
 use nertca_vk::trees::measurements;
 use nertca_vk::trees::over_frames;
 use nertca_vk::trees::tree::{BeatTree, CONFIDENCE, DOUBTFUL, TreeView};
@@ -144,10 +144,16 @@ fn find(
     })
 }
 
-/// Describes a lesion in a line.
-fn in_words(lesion: &Lesion) -> String {
+/// Describes a lesion, and its percentages over the beat where they are known, in a line.
+fn in_words(lesion: &Lesion, over_beat: &[f64]) -> String {
+    let (least, most) =
+        over_beat.iter().fold((f64::MAX, f64::MIN), |(a, b), percent| (a.min(*percent), b.max(*percent)));
+    let range = match over_beat {
+        [] | [_] => String::new(),
+        _ => format!("; {least:.0} to {most:.0} % in the fields of the phases"),
+    };
     format!(
-        "stenosis of {:.0} % in branch {}, {:.1} mm from the root: {:.2} mm instead of {:.2} mm, over {:.1} mm",
+        "stenosis of {:.0} % in branch {}, {:.1} mm from the root: {:.2} mm instead of {:.2} mm, over {:.1} mm{range}",
         lesion.percent(),
         lesion.branch,
         lesion.from_root_mm,
@@ -297,8 +303,9 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     // Followed points keep their radii, so that lesions differ between phases only as far as lengths change.
     let with_lesions = if beat.reference_phase.is_some() { 1 } else { beat.phases.len() };
     for tree in beat.phases.iter().take(with_lesions) {
-        for lesion in lesions(tree, beat.resolution_mm) {
-            eprintln!("phase {}: {}", tree.phase, in_words(&lesion));
+        let found = lesions(tree, beat.resolution_mm);
+        for (lesion, over_beat) in found.iter().zip(over_beat(&beat, &found)) {
+            eprintln!("phase {}: {}", tree.phase, in_words(lesion, &over_beat));
         }
     }
     eprintln!(
