@@ -69,7 +69,7 @@ unsafe extern "system" fn heard(
     vk::FALSE
 }
 
-/// Tells whether a device imports semaphores from opaque file descriptors: some drivers have the extension for other kinds alone.
+/// Returns whether a device imports semaphores from opaque file descriptors: some drivers have the extension for other kinds alone.
 unsafe fn imports_semaphores(instance: &ash::Instance, physical: vk::PhysicalDevice) -> bool {
     let opaque =
         vk::PhysicalDeviceExternalSemaphoreInfo::default().handle_type(vk::ExternalSemaphoreHandleTypeFlags::OPAQUE_FD);

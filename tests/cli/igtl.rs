@@ -42,7 +42,7 @@ fn axis(c_arm: &CArm) -> [f64; 3] {
     [-secondary.cos() * primary.sin(), secondary.cos() * primary.cos(), secondary.sin()]
 }
 
-/// The module of 3D Slicer asks for the names that are sent; stand-ins take the place of Slicer.
+/// The module of 3D Slicer connects and shows nodes with the names that are sent; stand-ins take the place of Slicer.
 #[test]
 fn the_module_of_slicer_connects_and_shows() {
     let root = crate::root::root();

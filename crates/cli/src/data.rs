@@ -49,7 +49,7 @@ pub struct ImportDicomArgs {
     #[arg(short, long)]
     pub force: bool,
     /// Keep references to the files in `references.json` of the dataset, so that results can be filed with them (`tree --presentation`):
-    /// UIDs and frame numbers, name and identifier of the patient, date of the study. By default, the dataset knows nothing of this.
+    /// UIDs and frame numbers, name and identifier of the patient, date of the study. By default, the dataset contains none of this.
     #[arg(long)]
     pub keep_references: bool,
     /// Options of reading runs.

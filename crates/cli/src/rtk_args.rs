@@ -28,7 +28,7 @@ pub struct ImportRtkArgs {
     /// Phase (from 0) of each projection, one per line; a projection may lie between two phases, e.g. 3.4.
     #[arg(long, value_name = "FILE", conflicts_with = "still")]
     pub phase_list: Option<PathBuf>,
-    /// The object does not move. The dataset says so, and results have one phase.
+    /// The object does not move. The dataset states it, and results have one phase.
     #[arg(long)]
     pub still: bool,
     /// Depth range to reconstruct in front of and behind the isocentre, mm.
