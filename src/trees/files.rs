@@ -4,7 +4,7 @@ use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::swc;
 use crate::formats::vtp::{self, Values};
-use crate::trees::lesions::{Lesion, lesions, over_beat};
+use crate::trees::lesions::{Lesion, MeasuredBeat, lesions};
 use crate::trees::sight::TreeInView;
 use crate::trees::tree::{BeatTree, Branch, Doubt, PhaseTree, TreeView};
 use crate::trees::tubes::to_glb;
@@ -93,7 +93,7 @@ struct SightRow {
 }
 
 impl LesionRow {
-    fn of((lesion, over_beat): (Lesion, Vec<f64>), tree: &PhaseTree, views: &[(&TreeView, TreeInView)]) -> LesionRow {
+    fn of(lesion: &Lesion, over_beat: Vec<f64>, tree: &PhaseTree, views: &[(&TreeView, TreeInView)]) -> LesionRow {
         let tenths = |percent: f64| (10.0 * percent).round() / 10.0;
         let sight = |(view, shown): &(&TreeView, TreeInView)| {
             let sight = shown.sight(tree, &lesion.places)?;
@@ -246,6 +246,7 @@ fn write_phases(
 /// # Errors
 /// [`Error::Internal`] for values that JSON cannot represent.
 pub fn to_json(beat: &BeatTree) -> Result<String> {
+    let measured = MeasuredBeat::new(beat);
     let phases = beat.phases.iter().map(|tree| {
         let found = lesions(tree, beat.resolution_mm);
         // Views are needed for lesions only.
@@ -256,9 +257,7 @@ pub fn to_json(beat: &BeatTree) -> Result<String> {
             branches: tree.branches.iter().map(BranchRow::of).collect(),
             lesions: found
                 .iter()
-                .cloned()
-                .zip(over_beat(beat, &found))
-                .map(|lesion| LesionRow::of(lesion, tree, &views))
+                .map(|lesion| LesionRow::of(lesion, measured.percents(lesion), tree, &views))
                 .collect(),
         }
     });

@@ -99,27 +99,32 @@ pub fn lesions(tree: &PhaseTree, resolution_mm: f64) -> Vec<Lesion> {
     straight_vessels(tree, resolution_mm).into_iter().flat_map(|vessel| vessel.lesions).collect()
 }
 
-/// Returns the diameter stenosis of lesions at each phase of a beat, percent, as the field of the phase has it: the worst place of the narrowed
-/// part. Empty where points are not followed, because each phase then has lesions of its own.
-pub fn over_beat(beat: &BeatTree, lesions: &[Lesion]) -> Vec<Vec<f64>> {
-    let mut percents = vec![Vec::new(); lesions.len()];
-    if lesions.is_empty() {
-        return percents;
+/// Vessels of each phase of a beat with the diameters that the field of the phase has, where points are followed.
+pub struct MeasuredBeat {
+    /// Vessels of each phase; empty where points are not followed, because each phase then has lesions of its own.
+    phases: Vec<Vec<StraightVessel>>,
+}
+
+impl MeasuredBeat {
+    /// Judges the vessels of a beat at each phase.
+    pub fn new(beat: &BeatTree) -> MeasuredBeat {
+        let vessels = |(tree, radii_mm): (&PhaseTree, &Vec<Vec<f64>>)| {
+            let mut measured = tree.clone();
+            let branches = measured.branches.iter_mut().zip(radii_mm);
+            branches.for_each(|(branch, radius_mm)| branch.radius_mm.clone_from(radius_mm));
+            straight_vessels(&measured, beat.resolution_mm)
+        };
+        MeasuredBeat { phases: beat.phases.iter().zip(&beat.measured_mm).map(vessels).collect() }
     }
-    for (tree, radii_mm) in beat.phases.iter().zip(&beat.measured_mm) {
-        let mut measured = tree.clone();
-        measured
-            .branches
-            .iter_mut()
-            .zip(radii_mm)
-            .for_each(|(branch, radius_mm)| branch.radius_mm.clone_from(radius_mm));
-        let vessels = straight_vessels(&measured, beat.resolution_mm);
-        for (lesion, percents) in lesions.iter().zip(&mut percents) {
+
+    /// Returns the diameter stenosis of a lesion at each phase, percent: the worst place of the narrowed part.
+    pub fn percents(&self, lesion: &Lesion) -> Vec<f64> {
+        let worst = |vessels: &Vec<StraightVessel>| {
             let narrowings = vessels.iter().flat_map(|vessel| vessel.narrowings(&lesion.places));
-            percents.push(100.0 * narrowings.fold(0.0, f64::max));
-        }
+            100.0 * narrowings.fold(0.0, f64::max)
+        };
+        self.phases.iter().map(worst).collect()
     }
-    percents
 }
 
 /// Returns the vessels of a tree with their diameters and stenoses, as [`lesions`] judges them; vessels that are too short to be judged are
@@ -355,13 +360,12 @@ mod tests {
             measured_mm: [0.6, 0.5, 0.0].map(|share| vec![with(share).branches[0].radius_mm.clone()]).into(),
         };
         let found = lesions(&beat.phases[0], SHARP_MM);
-        let percents = over_beat(&beat, &found);
-        let off = percents[0].iter().zip([60.0, 50.0, 0.0]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-        assert!(percents.len() == 1 && percents[0].len() == 3 && off < 3.0, "{percents:?}");
-        assert_eq!(percents[0][0], found[0].percent());
+        let percents = MeasuredBeat::new(&beat).percents(&found[0]);
+        let off = percents.iter().zip([60.0, 50.0, 0.0]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        assert!(percents.len() == 3 && off < 3.0, "{percents:?}");
+        assert_eq!(percents[0], found[0].percent());
         beat.measured_mm.clear();
-        assert_eq!(over_beat(&beat, &found), [Vec::<f64>::new()], "each phase has lesions of its own");
-        assert!(over_beat(&beat, &[]).is_empty());
+        assert!(MeasuredBeat::new(&beat).percents(&found[0]).is_empty(), "each phase has lesions of its own");
     }
 
     #[test]

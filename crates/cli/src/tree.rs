@@ -23,7 +23,7 @@ use nertca_vk::score::eval::Evaluation;
 use nertca_vk::trees::doubt::state_doubt;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
-use nertca_vk::trees::lesions::{Lesion, lesions, over_beat};
+use nertca_vk::trees::lesions::{Lesion, MeasuredBeat, lesions};
 use nertca_vk::trees::measurements;
 use nertca_vk::trees::over_frames;
 use nertca_vk::trees::tree::{BeatTree, CONFIDENCE, DOUBTFUL, TreeView};
@@ -301,11 +301,11 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
         );
     }
     // Followed points keep their radii, so that lesions differ between phases only as far as lengths change.
+    let measured = MeasuredBeat::new(&beat);
     let with_lesions = if beat.reference_phase.is_some() { 1 } else { beat.phases.len() };
     for tree in beat.phases.iter().take(with_lesions) {
-        let found = lesions(tree, beat.resolution_mm);
-        for (lesion, over_beat) in found.iter().zip(over_beat(&beat, &found)) {
-            eprintln!("phase {}: {}", tree.phase, in_words(lesion, &over_beat));
+        for lesion in lesions(tree, beat.resolution_mm) {
+            eprintln!("phase {}: {}", tree.phase, in_words(&lesion, &measured.percents(&lesion)));
         }
     }
     eprintln!(
