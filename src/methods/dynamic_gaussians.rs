@@ -11,6 +11,7 @@ pub mod filling;
 pub(crate) mod fine;
 pub mod fit;
 pub mod lengths;
+mod likelihood;
 mod linked;
 mod made;
 mod members;

@@ -4,24 +4,13 @@ use crate::config::sections;
 use crate::gaussians::field::rotation_none;
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::Gaussian;
+use crate::methods::dynamic_gaussians::likelihood::likelihoods;
 use crate::methods::dynamic_gaussians::targets::{PossibleVessel, Targets};
 use crate::random::{STREAM_JITTER, STREAM_PLACE, uniform01};
 use glam::DVec3;
 
 /// Share of the data that the first images explain: Gaussians grow into the rest.
 const FIRST_SHARE: f64 = 0.7;
-/// Log-likelihood ratio against a place far from the vessels of a prior.
-const FAR_EVIDENCE: f64 = 12.0;
-/// Evidence of four views at which half of the cells hold vessel, and the width over which that share rises.
-const LIKELY_EVIDENCE: f64 = 14.0;
-const EVIDENCE_WIDTH: f64 = 1.5;
-
-/// Probability that a cell of the hull holds vessel, as measured on phantoms.
-fn likelihood(evidence: f64, n_views: usize) -> f64 {
-    let likely = LIKELY_EVIDENCE / 4.0 * n_views.max(4) as f64;
-    1.0 / (1.0 + (-(evidence - likely) / EVIDENCE_WIDTH).exp())
-}
-
 /// Draws `count` of the indices of `weights` without replacement, with chances in proportion to the weights; returns them in
 /// ascending order.
 fn draw(weights: &[f64], count: usize, seed: u32, round: u32) -> Vec<usize> {
@@ -66,12 +55,9 @@ impl Draw<'_> {
 /// First Gaussians of every phase, of density 1; [`first_density`] tells the density they should have.
 pub fn seeds(targets: &Targets, settings: &sections::Gaussians, seed: u32) -> Vec<Gaussian> {
     let mut all = Vec::new();
-    for (phase, places) in targets.places.iter().enumerate() {
-        let n_views = targets.views_at(phase).count();
-        let weights: Vec<f64> =
-            places.iter().map(|p| likelihood(p.evidence - FAR_EVIDENCE * p.far_from_prior, n_views)).collect();
+    for phase in 0..targets.places.len() {
         let draw = Draw { targets, settings, seed, round: phase as u32 };
-        all.extend(draw.gaussians(&weights, settings.count as usize, phase, 1.0));
+        all.extend(draw.gaussians(&likelihoods(targets, phase), settings.count as usize, phase, 1.0));
     }
     all
 }
