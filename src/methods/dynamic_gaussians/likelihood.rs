@@ -17,7 +17,7 @@ const PER_EVIDENCE: f64 = 0.22;
 const PER_LOG_INTEGRAL: f64 = 1.25;
 const PER_CENTRALITY: f64 = 2.95;
 const CONSTANT: f64 = -3.01;
-/// Least line integral that is told from zero, as a share of the strongest change.
+/// Line integral below which a pixel shows no vessel, as a share of the strongest change.
 const LEAST_INTEGRAL: f64 = 0.02;
 
 /// Returns the probability that each place of a phase holds vessel.
