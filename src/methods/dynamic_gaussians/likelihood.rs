@@ -10,9 +10,9 @@ const EVIDENCE_WIDTH: f64 = 1.5;
 /// Log-odds against a place far from the vessels of a prior.
 const FAR_LOG_ODDS: f64 = 8.0;
 
-/// Logistic regression for places that two views see: log-odds per unit of evidence, per unit of the logarithm of the least line
-/// integral, and per unit of its share in the largest line integral nearby, and the constant. It was fitted to phases 0, 3 and 5 of two
-/// procedural trees, each in two pairs of views; places within 2 mm of a true centreline hold vessel.
+/// Coefficients of a logistic regression for places that two views see: log-odds per unit of evidence, per unit of the natural logarithm of
+/// the least line integral, per unit of the share that the pixel in the middle has of it, and the constant. They were fitted to phases 0, 3
+/// and 5 of two procedural trees, each in two pairs of views; places within 2 mm of a true centreline hold vessel.
 const PER_EVIDENCE: f64 = 0.22;
 const PER_LOG_INTEGRAL: f64 = 1.25;
 const PER_CENTRALITY: f64 = 2.95;
