@@ -59,6 +59,11 @@ impl Plan {
         })
     }
 
+    /// Returns the number of fits whose mean the field of a configuration is, for the data of this plan.
+    pub(crate) fn fits(&self, config: &Config) -> u32 {
+        self.data.as_ref().map_or(1, |data| data.fits(config))
+    }
+
     /// Returns this plan in a known scene, for example when resuming.
     pub fn in_scene(mut self, scene: Scene) -> Plan {
         if let Some(data) = &mut self.data {

@@ -10,6 +10,7 @@ mod inbox;
 mod known;
 mod long_work;
 mod progress;
+mod refining;
 mod showing;
 mod state;
 mod training;
@@ -286,8 +287,8 @@ impl Session {
     }
 
     /// Trains up to `iterations` more, with the frames there are, and returns how many were done: fewer at the end of
-    /// the run, or when the observer ends it, or [`Session::close`]. Views are calibrated, but not adjusted: only training in the background
-    /// does so.
+    /// the run, or when the observer ends it, or [`Session::close`]. Views are calibrated, but not adjusted, and a single fit is made
+    /// where `gaussians.fits` is 0: only training in the background refines the reconstruction.
     ///
     /// # Errors
     /// [`Error::Busy`] while it trains already, [`Error::NotReady`] without frames enough, [`Error::NoDevice`];
@@ -328,8 +329,8 @@ impl Session {
     }
 
     /// Trains in the background until the run is done, paused or stopped; waits for frames while there are too few. At the end of the
-    /// run, the views are adjusted where `calibrate.adjust` is `auto`, while the reconstruction so far is shown, and training goes on with
-    /// the corrected views.
+    /// run, while the reconstruction so far is shown, the views are adjusted where `calibrate.adjust` is `auto`. Then training goes on with
+    /// the corrected views, and with several fits where `gaussians.fits` is 0 and the data ask for their mean.
     ///
     /// # Errors
     /// [`Error::Busy`] when it trains already; [`Error::NoDevice`].
@@ -610,6 +611,7 @@ impl Session {
         (inbox.options.phases, inbox.options.still) = (phases, still);
         inbox.options.config = model.config.clone();
         engine.training = None;
+        engine.unrefined = None;
         engine.version = 0;
         *lock(&self.shared.calibration) = None;
         self.shared.publish(Source::of(model), Some(0));

@@ -85,7 +85,7 @@ impl<'a> SavedFields<'a> {
     pub(crate) fn at(from: Beginning<'a>) -> Option<SavedFields<'a>> {
         match from {
             Beginning::Resumed(saved) | Beginning::CarriedOn(saved) => SavedFields::of(saved),
-            Beginning::Scratch | Beginning::Made(_) | Beginning::AfterGaussians(_) => None,
+            Beginning::Scratch | Beginning::Prepared(_) | Beginning::AfterGaussians(_) => None,
         }
     }
 

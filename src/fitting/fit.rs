@@ -127,6 +127,15 @@ pub struct MadeGaussians {
     pub fingerprint: String,
 }
 
+/// Gaussians that were fitted to the images of a run before it begins.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct PreparedGaussians<'a> {
+    /// Fit that is not repeated where it is one of the run's.
+    pub made: Option<&'a MadeGaussians>,
+    /// Field that is shown until the run has a better one.
+    pub shown: Option<&'a DynamicGaussians>,
+}
+
 /// Receives the share of a work that is done; an error ends the work.
 pub type Observe<'a> = dyn FnMut(f64) -> Result<()> + 'a;
 
@@ -230,8 +239,8 @@ pub trait FitState: Debug + Send + Sync {
 pub enum Beginning<'a> {
     /// The fit begins from scratch.
     Scratch,
-    /// The fit begins from scratch; a fit of Gaussians that was made before need not be repeated where it is the same.
-    Made(&'a MadeGaussians),
+    /// The fit begins from scratch, with Gaussians that were fitted before.
+    Prepared(PreparedGaussians<'a>),
     /// The fit continues a fit to the same data; the result is that of an uninterrupted one.
     Resumed(&'a SavedFit),
     /// The fit goes on from a fit to other data, as far as the method can.
@@ -290,6 +299,11 @@ pub trait FitData: Send {
     /// Returns the motion hull that bounds the dynamic field, if there is one.
     fn hull(&self) -> Option<&Hull> {
         None
+    }
+
+    /// Returns the number of fits whose mean the field of a configuration is.
+    fn fits(&self, _config: &Config) -> u32 {
+        1
     }
 
     /// Returns the weighted loss of an empty dynamic field, where it is known.

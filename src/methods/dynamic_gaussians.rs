@@ -139,6 +139,10 @@ impl FitData for GaussianData {
         self.fields.hull()
     }
 
+    fn fits(&self, config: &Config) -> u32 {
+        self.targets.fits(config.gaussians.fits).0
+    }
+
     fn set_scene(&mut self, scene: &Scene) {
         self.fields.set_scene(scene);
     }

@@ -12,7 +12,7 @@ use crate::checkpoint::{self, Checkpoint};
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::files;
-use crate::fitting::fit::{AdjustTask, MadeGaussians};
+use crate::fitting::fit::{AdjustTask, MadeGaussians, PreparedGaussians};
 use crate::fitting::losses::LargeLoss;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
@@ -96,7 +96,8 @@ pub fn reconstruct(
         if let Some(hull) = &plan.hull {
             hull_pictures::write(&options.run.join("report"), dataset, hull)?;
         }
-        Trainer::after_adjustment(gpu, plan, dataset, options.tuning.clone(), made.as_ref())?
+        let gaussians = PreparedGaussians { made: made.as_ref(), shown: None };
+        Trainer::prepared(gpu, plan, dataset, options.tuning.clone(), gaussians)?
     };
     let config = trainer.plan().config.clone();
     files::write_atomic(&options.run.join(CONFIG), config.to_toml()?.as_bytes())?;

@@ -5,19 +5,13 @@ use crate::calibrate::correction::Calibration;
 use crate::error::Result;
 use crate::fitting::fit::{AdjustTask, AdjustedFit, MadeGaussians};
 use crate::methods;
-use crate::scan::dataset::Dataset;
 
 /// Outcome of the adjustment of a session's views.
 pub(super) struct AdjustedViews {
     pub(super) calibration: Calibration,
-    /// Views that were corrected; none where they stay as they are.
-    pub(super) corrected: Option<CorrectedViews>,
-}
-
-/// Views that were corrected.
-pub(super) struct CorrectedViews {
-    pub(super) dataset: Dataset,
-    /// Fit to these views; none where it was made with coarser images.
+    /// Whether the calibration of views has changed.
+    pub(super) are_corrected: bool,
+    /// Fit to these views; none where it was made with coarser images, or no adjustment was tried.
     pub(super) made: Option<MadeGaussians>,
 }
 
@@ -38,14 +32,9 @@ pub(super) fn adjust(task: &AdjustTask<'_>, proceed: &dyn Fn() -> Result<()>) ->
     };
     let calibration = task.calibration.clone();
     let Some(AdjustedFit { adjusted: outcome, made }) = methods::of(task.config).adjust(task, &mut observe)? else {
-        return Ok(AdjustedViews { calibration, corrected: None });
+        return Ok(AdjustedViews { calibration, are_corrected: false, made: None });
     };
     tracing::info!("{}", outcome.record.describe());
-    let accepted = outcome.record.accepted;
-    let calibration = adjusted(task.dataset, calibration, outcome)?;
-    let corrected = match accepted {
-        true => Some(CorrectedViews { dataset: task.dataset.corrected(&calibration)?, made }),
-        false => None,
-    };
-    Ok(AdjustedViews { calibration, corrected })
+    let are_corrected = outcome.record.accepted;
+    Ok(AdjustedViews { calibration: adjusted(task.dataset, calibration, outcome)?, are_corrected, made })
 }

@@ -323,7 +323,7 @@ impl Inbox {
         Ok((dataset, taken))
     }
 
-    /// The configuration of training.
+    /// Returns the configuration of training while frames may arrive.
     pub(super) fn training_config(&self) -> Config {
         let mut config = self.options.config.clone();
         if config.gaussians.fits == 0 {
@@ -331,6 +331,11 @@ impl Inbox {
             config.gaussians.fits = 1;
         }
         config
+    }
+
+    /// Returns the configuration of training after a fit to all frames has ended.
+    pub(super) fn refining_config(&self) -> Config {
+        self.options.config.clone()
     }
 
     /// Explains how many training frames are left out and why.

@@ -62,8 +62,12 @@ pub(super) struct Engine {
     /// Version of the inbox from which the trainer was built.
     pub(super) version: u64,
     pub(super) frames: u32,
-    /// Version of the inbox whose views were adjusted, or need no adjustment; 0 for none.
-    pub(super) adjusted: u64,
+    /// Whether the data ask for the mean of several fits, which follow the first one.
+    pub(super) repeats: bool,
+    /// Version of the inbox whose reconstruction was refined, or needs no refinement; 0 for none.
+    pub(super) refined: u64,
+    /// State before the refinement, from which training with other frames goes on.
+    pub(super) unrefined: Option<Checkpoint>,
     /// Pause before new frames are taken in.
     pub(super) settling: Option<Settling>,
 }

@@ -1,18 +1,14 @@
-//! Training of a session: new frames are taken in, views adjusted, iterations run in the background.
+//! Training of a session: new frames are taken in, and iterations run in the background.
 
 use crate::calibrate::calibrate;
-use crate::calibrate::correction::Calibration;
 use crate::error::{Error, Result};
-use crate::fitting::fit::AdjustTask;
-use crate::gpu::device::Gpu;
-use crate::kernels::tuning::Tuning;
 use crate::methods;
 use crate::model::Model;
 use crate::model::scene::Scene;
 use crate::plan::Plan;
 use crate::render::live::Source;
-use crate::session::adjusting::{AdjustedViews, CorrectedViews, adjust};
 use crate::session::progress::{Observer, Progress, State};
+use crate::session::refining::{AfterTraining, beside_pictures};
 use crate::session::state::{Engine, Settling, Shared, Viewer, lock};
 use crate::train::trainer::Trainer;
 use crate::train::training::Training;
@@ -31,15 +27,6 @@ const WAITING: Duration = Duration::from_secs(1);
 /// Interval at which training looks again while others wait for the engine.
 const GIVE_WAY: Duration = Duration::from_micros(200);
 
-/// Training after the adjustment of views.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum AfterAdjusting {
-    /// The views stay as they are, so that training has ended.
-    Ended,
-    /// The views were corrected, and training goes on with them.
-    TrainsOn,
-}
-
 impl Shared {
     /// Brings the trainer up to the frames there are; `begin` is called when there are enough new ones.
     pub(super) fn take_in_frames(&self, engine: &mut Engine, begin: impl FnOnce()) -> Result<()> {
@@ -49,10 +36,10 @@ impl Shared {
             return Ok(());
         }
         let started = Instant::now();
-        let ((dataset, taken), config, left_out) = {
+        let ((dataset, taken), config, refining_config, left_out) = {
             let inbox = lock(&self.inbox);
             let left_out = inbox.leaves_out().then(|| inbox.why_left_out());
-            (inbox.training_dataset()?, inbox.training_config(), left_out)
+            (inbox.training_dataset()?, inbox.training_config(), inbox.refining_config(), left_out)
         };
         begin();
         if let Some(why) = left_out {
@@ -64,9 +51,14 @@ impl Shared {
         calibration.notes.iter().for_each(|note| tracing::info!("{note}"));
         let dataset = dataset.corrected(&calibration)?;
         let fresh = Plan::new(&config, &dataset)?;
+        let repeats = fresh.fits(&refining_config) > fresh.fits(&config);
         let mut earlier = None;
         if let Some(training) = &mut engine.training {
-            let mut state = training.trainer_mut().checkpoint()?;
+            // Fits with other frames cannot go on from the mean of several, nor from one to views that are calibrated anew.
+            let mut state = match engine.unrefined.take() {
+                Some(state) => state,
+                None => training.trainer_mut().checkpoint()?,
+            };
             let fits = holds(&state.model, &fresh.scene);
             if !fits {
                 tracing::warn!(
@@ -93,78 +85,15 @@ impl Shared {
         trainer.plan().notes.iter().for_each(|note| tracing::info!("{note}"));
         *lock(&self.calibration) = Some(calibration);
         engine.frames = dataset.training().len() as u32;
-        // These views are calibrated, and not adjusted yet.
-        (engine.version, engine.adjusted) = (version, 0);
+        (engine.version, engine.refined, engine.repeats) = (version, 0, repeats);
         *lock(&self.taken) = taken;
         let took = started.elapsed();
         engine.settling = Some(Settling { until: Instant::now() + took * SETTLE, quiet: took.max(QUIET) });
         self.show(engine, trainer)
     }
 
-    /// Adjusts the views of the frames that training has ended with, `version` of the inbox, once. The reconstruction so far is shown
-    /// meanwhile.
-    ///
-    /// # Errors
-    /// [`Error::Interrupted`] where frames have changed meanwhile, or training is to stop or to pause; device errors.
-    fn adjust_views(&self, version: u64) -> Result<AfterAdjusting> {
-        let (gpu, tuning) = self.device()?;
-        if lock(&self.engine).adjusted == version {
-            return Ok(AfterAdjusting::Ended);
-        }
-        let (dataset, mut config) = {
-            let inbox = lock(&self.inbox);
-            (inbox.training_dataset()?.0, inbox.training_config())
-        };
-        let tuning = beside_pictures(gpu, tuning);
-        config.train.iterations_per_submit = tuning.iterations_per_submit.unwrap_or(config.train.iterations_per_submit);
-        let calibration = lock(&self.calibration).clone().unwrap_or_else(|| Calibration::none(None));
-        let task = AdjustTask { gpu, config: &config, dataset: &dataset, calibration: &calibration };
-        let proceed = || {
-            gpu.looks().give_way();
-            self.goes_on(version)
-        };
-        let AdjustedViews { calibration, corrected } = adjust(&task, &proceed)?;
-        self.goes_on(version)?;
-        let Some(CorrectedViews { dataset, made }) = corrected else {
-            lock(&self.engine).adjusted = version;
-            *lock(&self.calibration) = Some(calibration);
-            return Ok(AfterAdjusting::Ended);
-        };
-        let plan = match Plan::new(&config, &dataset) {
-            Err(why @ (Error::Config { .. } | Error::Unmet { .. } | Error::Data { .. })) => {
-                tracing::warn!(
-                    "the views stay as they are, because nothing can be fitted to the corrected ones: {why}"
-                );
-                lock(&self.engine).adjusted = version;
-                return Ok(AfterAdjusting::Ended);
-            }
-            plan => plan?,
-        };
-        let mut engine = lock(&self.engine);
-        self.goes_on(version)?;
-        // The reconstruction so far stays until the new one is saved; the memory of its trainer is needed.
-        if let Some(training) = &mut engine.training {
-            let state = training.trainer_mut().checkpoint()?;
-            engine.saved = Some(state);
-        }
-        engine.training = None;
-        self.free_fields();
-        let trainer = Trainer::after_adjustment(gpu, plan, &dataset, tuning, made.as_ref())?;
-        engine.adjusted = version;
-        *lock(&self.calibration) = Some(calibration);
-        self.show(&mut engine, trainer)?;
-        Ok(AfterAdjusting::TrainsOn)
-    }
-
-    /// Returns an error where the frames are no longer those of `version`, or training is to stop or to pause.
-    fn goes_on(&self, version: u64) -> Result<()> {
-        let ends = self.stop.load(Ordering::Acquire) || self.pause.load(Ordering::Acquire);
-        let is_current = self.version.load(Ordering::Acquire) == version;
-        if ends || !is_current { Err(Error::Interrupted) } else { Ok(()) }
-    }
-
     /// Trains and shows a trainer from now on.
-    fn show(&self, engine: &mut Engine, trainer: Trainer) -> Result<()> {
+    pub(super) fn show(&self, engine: &mut Engine, trainer: Trainer) -> Result<()> {
         self.step.store(trainer.step(), Ordering::Release);
         let shown = (!trainer.shows_earlier()).then_some(engine.frames);
         let source = Source { outline: trainer.outline(), feed: trainer.feed() };
@@ -318,9 +247,9 @@ impl Shared {
                 return Ok(State::Cancelled);
             }
             if done {
-                match self.adjust_views(version) {
-                    Ok(AfterAdjusting::Ended) => return Ok(State::Finished),
-                    Ok(AfterAdjusting::TrainsOn) | Err(Error::Interrupted) => continue,
+                match self.refine(version) {
+                    Ok(AfterTraining::Ended) => return Ok(State::Finished),
+                    Ok(AfterTraining::TrainsOn) | Err(Error::Interrupted) => continue,
                     Err(error) => return Err(error),
                 }
             }
@@ -353,16 +282,6 @@ impl Shared {
         let control = lock(&self.control);
         has_work(control.state, control.waits_at, self.version.load(Ordering::Acquire))
     }
-}
-
-/// Returns the tuning of work beside which pictures are drawn.
-fn beside_pictures(gpu: &Gpu, tuning: &Tuning) -> Tuning {
-    let mut tuning = tuning.clone();
-    if gpu.info().is_cpu() {
-        // Views wait for what was submitted before them.
-        tuning.iterations_per_submit = Some(1);
-    }
-    tuning
 }
 
 /// Time without a new frame after which no other is expected soon, at most `longest`: a fit that begins without the last frames of a run is

@@ -4,7 +4,7 @@ use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::fields::trainer::FieldsFit;
 use crate::fingerprint::Fingerprint;
-use crate::fitting::fit::{Beginning, FieldFeed, Fit, FitField, FitStart, MadeGaussians};
+use crate::fitting::fit::{Beginning, FieldFeed, Fit, FitField, FitStart, PreparedGaussians};
 use crate::fitting::ledger::Ledger;
 use crate::fitting::losses::{LargeLoss, LossWatch, StepLoss};
 use crate::gaussians::field::DynamicGaussians;
@@ -76,21 +76,21 @@ impl Trainer {
     /// [`Error::Config`] when `tuning` asks for what the device lacks; device errors, [`Error::OutOfMemory`] first of
     /// all.
     pub fn new(gpu: &Gpu, plan: Plan, dataset: &Dataset, tuning: Tuning) -> Result<Trainer> {
-        Self::after_adjustment(gpu, plan, dataset, tuning, None)
+        Self::start(gpu, plan, dataset, tuning, Beginning::Scratch)
     }
 
-    /// Starts a run from scratch, with a fit of Gaussians that was made while its views were adjusted.
+    /// Starts a run from scratch, with Gaussians that were fitted before, for example while its views were adjusted.
     ///
     /// # Errors
     /// Errors of [`Trainer::new`].
-    pub fn after_adjustment(
+    pub fn prepared(
         gpu: &Gpu,
         plan: Plan,
         dataset: &Dataset,
         tuning: Tuning,
-        made: Option<&MadeGaussians>,
+        gaussians: PreparedGaussians<'_>,
     ) -> Result<Trainer> {
-        Self::start(gpu, plan, dataset, tuning, made.map_or(Beginning::Scratch, Beginning::Made))
+        Self::start(gpu, plan, dataset, tuning, Beginning::Prepared(gaussians))
     }
 
     /// Starts a run from scratch but for its Gaussians, which go on from those that were fitted to `earlier` data as in

@@ -6,9 +6,9 @@ use glam::DVec3;
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::calibrate::pose::Poses;
 use nertca_vk::calibrate::{adjusted, calibrate};
-use nertca_vk::config::{Config, Preset};
+use nertca_vk::config::{AdjustMode, Config, Preset};
 use nertca_vk::fields::scale::dynamic_half;
-use nertca_vk::fitting::fit::{AdjustTask, MadeGaussians};
+use nertca_vk::fitting::fit::{AdjustTask, MadeGaussians, PreparedGaussians};
 use nertca_vk::gaussians::field::DeformableGaussians;
 use nertca_vk::gaussians::view::SplatView;
 use nertca_vk::geometry::MM_PER_UNIT;
@@ -188,11 +188,15 @@ fn adjust(gpu: &Gpu, shot: &Shot, calibration: &Calibration) -> (Calibration, Ma
     (after, outcome.made.unwrap())
 }
 
+fn made_before(made: &MadeGaussians) -> PreparedGaussians<'_> {
+    PreparedGaussians { made: Some(made), shown: None }
+}
+
 /// Trains to the end of the Gaussians with and without the fit that an adjustment has left, and checks that the results are the same.
 fn expect_taken_over(gpu: &Gpu, dataset: &Dataset, made: &MadeGaussians) {
     let config = fast();
     let plan = || Plan::new(&config, dataset).unwrap();
-    let mut with = Trainer::after_adjustment(gpu, plan(), dataset, tuning(gpu), Some(made)).unwrap();
+    let mut with = Trainer::prepared(gpu, plan(), dataset, tuning(gpu), made_before(made)).unwrap();
     let mut without = Trainer::new(gpu, plan(), dataset, tuning(gpu)).unwrap();
     let end = config.gaussians.iterations;
     assert!(without.preparation().is_some(), "a fit from scratch prepares its Gaussians");
@@ -235,15 +239,19 @@ fn views_that_agree_are_not_adjusted() {
     expect_taken_over(&gpu, &after, &made);
     let other = MadeGaussians { fingerprint: "of other data".into(), ..made };
     let plan = Plan::new(&fast(), &after).unwrap();
-    let trainer = Trainer::after_adjustment(&gpu, plan, &after, tuning(&gpu), Some(&other)).unwrap();
+    let trainer = Trainer::prepared(&gpu, plan, &after, tuning(&gpu), made_before(&other)).unwrap();
     assert!(trainer.preparation().is_some(), "the fit to other data is not taken over");
 }
 
-/// A session with the frames of a shot.
+/// A session with the frames of a shot and default settings.
 pub fn session(gpu: &Gpu, shot: &Shot) -> Session {
+    session_with(gpu, shot, fast())
+}
+
+fn session_with(gpu: &Gpu, shot: &Shot, config: Config) -> Session {
     let dataset = &shot.dataset;
     let options = SessionOptions {
-        config: fast(),
+        config,
         phases: dataset.n_phases,
         depth_half_extent_mm: 0.5 * (dataset.depth_range.1 - dataset.depth_range.0) * MM_PER_UNIT,
         vessel_attenuation_per_mm: None,
@@ -288,6 +296,7 @@ fn a_session_adjusts_its_views_when_training_has_ended_and_trains_on() {
     // The field that is shown belongs to the corrected views: their frames are taken in, and drawn where the frames show them.
     let model = session.checkpoint().unwrap().model;
     assert_eq!(model.step, fast().train.iterations);
+    assert!(model.gaussians.as_ref().unwrap().rows().agreement.is_some(), "the mean of several fits");
     assert!(session.corrected_frame(0).unwrap().view.is_some());
     // Training that is started again has nothing left to do.
     session.start(Box::new(|_| true)).unwrap();
@@ -325,6 +334,80 @@ fn a_session_that_is_stopped_while_it_adjusts_keeps_its_reconstruction() {
     println!("{record:?}");
     assert!(!record.accepted && record.misfit_after.is_none(), "{record:?}");
     expect_silence_of(Arc::into_inner(session).unwrap(), gpu);
+}
+
+/// Settings of short fits, of which two views need several.
+fn short() -> Config {
+    let mut config = fast();
+    config.calibrate.adjust = AdjustMode::Off;
+    (config.gaussians.iterations, config.train.iterations) = (30, 40);
+    config
+}
+
+fn of_two_views(gpu: &Gpu) -> Shot {
+    let mut shot = Studio::new(gpu, SIZE, 1).shoot(3, false, Wrong { seed: 11, ..Wrong::default() });
+    shot.dataset.frames.retain(|frame| frame.view < 2);
+    shot.dataset.views.truncate(2);
+    shot
+}
+
+#[test]
+fn a_session_ends_with_the_mean_of_fits_and_goes_on_from_a_single_one() {
+    let gpu = gpu();
+    let shot = of_two_views(&gpu);
+    let gaussians = |session: &Session| session.checkpoint().unwrap().model.gaussians.unwrap();
+    let single = session_with(&gpu, &shot, short());
+    single.train(u32::MAX, &mut |_| true).unwrap();
+    assert!(gaussians(&single).rows().agreement.is_none(), "training in the caller's thread makes a single fit");
+    let refined = session_with(&gpu, &shot, short());
+    refined.start(Box::new(|_| true)).unwrap();
+    assert!(refined.wait(Duration::from_secs(900)) && refined.state() == State::Finished);
+    // The mean is that of a run with the same images.
+    let calibration = refined.calibration().unwrap();
+    let dataset = shot.dataset.corrected(&calibration).unwrap();
+    let mut run_of_mean = Trainer::new(&gpu, Plan::new(&short(), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    run(&mut run_of_mean, short().train.iterations);
+    let mean = gaussians(&refined);
+    assert!(mean.rows().agreement.is_some());
+    assert_eq!(mean.rows().rows, run_of_mean.model().unwrap().gaussians.unwrap().rows().rows);
+    drop(run_of_mean);
+    // Other frames: both go on from the single fit.
+    for session in [&single, &refined] {
+        session.remove_frame(3).unwrap();
+        session.train(5, &mut |_| true).unwrap();
+    }
+    assert_eq!(gaussians(&refined), gaussians(&single));
+    single.stop().unwrap();
+    drop(single);
+    expect_silence_of(refined, gpu);
+}
+
+#[test]
+fn an_earlier_field_is_shown_until_the_first_of_several_fits_is_done() {
+    let gpu = gpu();
+    let shot = of_two_views(&gpu);
+    let (dataset, config) = (&shot.dataset, short());
+    let mut alone = config.clone();
+    alone.gaussians.fits = 1;
+    let mut first = Trainer::new(&gpu, Plan::new(&alone, dataset).unwrap(), dataset, tuning(&gpu)).unwrap();
+    run(&mut first, config.gaussians.iterations);
+    let earlier = first.model().unwrap().gaussians.unwrap();
+    drop(first);
+    let gaussians = PreparedGaussians { made: None, shown: Some(&earlier) };
+    let plan = Plan::new(&config, dataset).unwrap();
+    let mut trainer = Trainer::prepared(&gpu, plan, dataset, tuning(&gpu), gaussians).unwrap();
+    let shown = |trainer: &Trainer| trainer.feed().gaussians.unwrap().lock().unwrap().1.clone();
+    let mut shares = Vec::new();
+    while trainer.shows_earlier() {
+        assert_eq!(shown(&trainer), earlier);
+        shares.push(trainer.preparation().unwrap());
+        trainer.advance(config.train.iterations).unwrap();
+    }
+    assert!(shares.len() > 5 && shares.windows(2).all(|pair| pair[0] <= pair[1]), "{shares:?}");
+    assert_eq!(trainer.preparation(), Some(0.2), "the first of five fits is done");
+    assert!(shown(&trainer) != earlier && shown(&trainer).rows().agreement.is_none());
+    drop(trainer);
+    expect_silence(gpu);
 }
 
 fn expect_silence_of(session: Session, gpu: Gpu) {

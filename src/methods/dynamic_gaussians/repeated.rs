@@ -45,7 +45,7 @@ pub(crate) struct Repeated {
     fits: u32,
     /// Fields of the fits that are done.
     done: Vec<DynamicGaussians>,
-    /// Mean of these fields, which is shown meanwhile.
+    /// Mean of these fields and of the fit that was made before, which is shown meanwhile.
     so_far: Option<DynamicGaussians>,
     fit: GaussianFit,
     /// Last fit, where it was made before.
@@ -65,7 +65,8 @@ impl Repeated {
             (0 | 1, None) => Ok(Repeated::once(gpu, config, GaussianFit::new(gpu, targets, config)?)),
             (fits, made) => {
                 let fit = GaussianFit::new(gpu, targets.clone(), &seeded(config, fits - 1))?;
-                Ok(Repeated { fits, made, targets: Some(targets), ..Repeated::once(gpu, config, fit) })
+                let so_far = made.as_ref().map(GaussianFit::field).transpose()?;
+                Ok(Repeated { fits, made, so_far, targets: Some(targets), ..Repeated::once(gpu, config, fit) })
             }
         }
     }
@@ -87,7 +88,7 @@ impl Repeated {
 
     /// Tells whether the field of a fit of `end` iterations is worth more than one that was fitted to fewer frames.
     pub(crate) fn is_presentable(&self, end: u32) -> bool {
-        self.so_far.is_some() || self.fit.is_presentable(end)
+        self.so_far.is_some() || self.fits == 1 && self.fit.is_presentable(end)
     }
 
     fn is_last(&self) -> bool {
@@ -127,7 +128,7 @@ impl Repeated {
         self.fit.advance(end)?;
         if self.fit.step() >= end {
             self.done.push(self.fit.field()?);
-            self.so_far = Some(mean(&self.done)?);
+            self.so_far = Some(self.mean_with(self.made.as_ref())?);
             let left = self.fits.saturating_sub(1 + self.done.len() as u32);
             self.fit = match self.made.take_if(|_| left == 0) {
                 Some(made) => made,
@@ -160,8 +161,13 @@ impl Repeated {
         if !self.is_last() || self.fit.step() < self.config.gaussian_iterations() {
             return Ok(so_far.clone());
         }
-        let all: Vec<DynamicGaussians> = self.done.iter().cloned().chain([self.fit.field()?]).collect();
-        mean(&all)
+        self.mean_with(Some(&self.fit))
+    }
+
+    /// Returns the mean of the fits that are done and of another one.
+    fn mean_with(&self, other: Option<&GaussianFit>) -> Result<DynamicGaussians> {
+        let other = other.map(GaussianFit::field).transpose()?;
+        mean(&self.done.iter().cloned().chain(other).collect::<Vec<_>>())
     }
 }
 

@@ -3,7 +3,7 @@
 use crate::error::Result;
 use crate::fields::state::PendingBehind;
 use crate::fields::trainer::{FieldsFit, SavedFields};
-use crate::fitting::fit::{Beginning, FieldFeed, Fit, FitField, FitStart, PendingFit};
+use crate::fitting::fit::{Beginning, FieldFeed, Fit, FitField, FitStart, PendingFit, PreparedGaussians};
 use crate::fitting::ledger::Ledger;
 use crate::fitting::losses::{SMALLER_STEPS, StepLoss};
 use crate::gaussians::field::{DynamicGaussians, GaussianFeed};
@@ -49,11 +49,11 @@ impl GaussiansFit {
         let earlier = match start.from {
             Beginning::CarriedOn(saved) => saved.field.gaussians.as_ref(),
             Beginning::AfterGaussians(gaussians) => Some(gaussians),
-            Beginning::Scratch | Beginning::Made(_) | Beginning::Resumed(_) => None,
+            Beginning::Scratch | Beginning::Prepared(_) | Beginning::Resumed(_) => None,
         };
-        let made = match start.from {
-            Beginning::Made(made) => Some(made),
-            _ => None,
+        let prepared = match start.from {
+            Beginning::Prepared(prepared) => prepared,
+            _ => PreparedGaussians::default(),
         };
         let done = resumed.and_then(SavedFields::of).map_or(0, |saved| saved.step());
         let end = config.gaussian_iterations();
@@ -63,7 +63,7 @@ impl GaussiansFit {
             None => {
                 let mut fit = match earlier {
                     Some(earlier) => Repeated::once(gpu, config, GaussianFit::after(gpu, targets, config, earlier)?),
-                    None => Repeated::new(gpu, targets, config, made)?,
+                    None => Repeated::new(gpu, targets, config, prepared.made)?,
                 };
                 while fit.step() < done {
                     fit.advance(done)?;
@@ -72,7 +72,8 @@ impl GaussiansFit {
                 (Some(fit), field)
             }
         };
-        let shown = earlier.filter(|_| gaussians.as_ref().is_some_and(|fit| !fit.is_presentable(end)));
+        let shown =
+            earlier.or(prepared.shown).filter(|_| gaussians.as_ref().is_some_and(|fit| !fit.is_presentable(end)));
         let shows_earlier = shown.is_some();
         let saved_fields = SavedFields::at(start.from);
         let done = match &gaussians {
