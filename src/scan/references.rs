@@ -168,6 +168,15 @@ impl References {
         Ok(())
     }
 
+    /// Returns the references of a dataset with the same frames in other files: `frames` are their names here, and their files there.
+    pub fn of_other_files<'a>(&self, frames: impl Iterator<Item = (&'a str, &'a Path)>) -> References {
+        let image = |(name, file): (&str, &Path)| {
+            let (_, image) = self.of_frame(name)?;
+            Some(ReferencedImage { image: file.to_owned(), ..image.clone() })
+        };
+        References { images: frames.filter_map(image).collect(), ..self.clone() }
+    }
+
     /// Returns the references of a frame of the dataset by its name, which is that of its image file.
     pub fn of_frame(&self, name: &str) -> Option<(&ReferencedRun, &ReferencedImage)> {
         let image = self.images.iter().find(|image| image.image.file_stem().is_some_and(|stem| stem == name))?;
@@ -217,6 +226,10 @@ mod tests {
         assert_eq!(read, good);
         assert_eq!(read.of_frame("train-view0-phase03").unwrap().1.frames, [7, 19]);
         assert!(read.of_frame("train-view1-phase03").is_none());
+        let files = [("train-view0-phase03", "train/a.png"), ("train-view1-phase03", "train/b.png")];
+        let other = read.of_other_files(files.into_iter().map(|(name, file)| (name, Path::new(file))));
+        assert_eq!((other.images.len(), &other.runs), (1, &read.runs), "a frame without references has none elsewhere");
+        assert_eq!(other.of_frame("a").unwrap().1.frames, [7, 19]);
         type Change = fn(&mut References);
         let changes: [(Change, &str); 7] = [
             (|r| r.version = 2, "format"),

@@ -231,16 +231,17 @@ pub fn authors_angles(common: &CArm, geometry: &Geometry) -> Result<(f64, f64)> 
     Ok((c_arm.primary_deg, c_arm.secondary_deg))
 }
 
-/// Writes a dataset in a layout. Stored values become line integrals.
+/// Writes a dataset in a layout. Stored values become line integrals. Returns the image file of each frame, relative to `out`.
 ///
 /// # Errors
 /// [`Error::Config`] for properties that the layout cannot state; [`Error::Io`].
-pub fn convert(dataset: &Dataset, layout: Layout, out: &Path) -> Result<()> {
+pub fn convert(dataset: &Dataset, layout: Layout, out: &Path) -> Result<Vec<PathBuf>> {
     let description = format!("converted from {:?}", dataset.layout).to_lowercase();
     write(dataset, layout, out, description, &|_| None)
 }
 
-/// Writes a dataset of line integrals; `stated` returns the geometry of a view before it was corrected.
+/// Writes a dataset of line integrals; `stated` returns the geometry of a view before it was corrected. Returns the image file of each
+/// frame, relative to `out`.
 ///
 /// # Errors
 /// Errors of [`convert`].
@@ -250,7 +251,7 @@ pub fn write(
     out: &Path,
     description: String,
     stated: &dyn Fn(usize) -> Option<Geometry>,
-) -> Result<()> {
+) -> Result<Vec<PathBuf>> {
     let (low, high) = dataset.depth_range;
     if layout == Layout::Nerfca && (low + high).abs() > 1e-9 {
         return Err(Error::config("layout", "nerfca", "the depth range is not centred"));
@@ -277,12 +278,15 @@ pub fn write(
             c_arm: dataset.reference_c_arm(),
         },
     )?;
+    let mut image_files = Vec::with_capacity(dataset.frames.len());
     for frame in &dataset.frames {
         let view = &dataset.views[frame.view];
         let (own, [width, height]) = (dataset.own_frame(frame).into_owned(), view.size);
         let image = Image { width, height, values: own.integrals.into_vec() };
-        writer.frame(&view.geometry, frame.split, frame.view, frame.beat_time(), &image, own.mask.as_deref())?;
+        let (taken, mask) = (frame.beat_time(), own.mask.as_deref());
+        image_files.push(writer.frame(&view.geometry, frame.split, frame.view, taken, &image, mask)?);
         writer.corrected(frame.heart_shift_mm, stated(frame.view).as_ref())?;
     }
-    writer.finish()
+    writer.finish()?;
+    Ok(image_files)
 }

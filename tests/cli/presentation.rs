@@ -50,6 +50,35 @@ fn runs(directory: &Path) -> Vec<PathBuf> {
     ANGLES.iter().enumerate().map(render).collect()
 }
 
+/// Reads the references of a dataset: file and source frames of each image.
+fn images(dataset: &Path) -> Vec<(PathBuf, serde_json::Value)> {
+    let text = std::fs::read_to_string(dataset.join("references.json")).unwrap();
+    let references: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let image = |image: &serde_json::Value| {
+        (dataset.join(image["image"].as_str().unwrap()), serde_json::json!([image["run"], image["frames"]]))
+    };
+    references["images"].as_array().unwrap().iter().map(image).collect()
+}
+
+/// Expects that other layouts and corrected geometry keep the references of a dataset where they are asked to.
+fn expect_kept_in_copies(data: &Path, copy: &Path) {
+    let convert = ["convert", text(data), "--layout", "nerfca", "-o", text(copy)];
+    let calibrate = ["calibrate", text(data), "--force", "-o", text(copy)];
+    for command in [&convert[..], &calibrate[..]] {
+        let said = run(&[command, &["--keep-references"]].concat(), true);
+        assert!(!said.contains("is not kept"), "{said}");
+        let (here, there) = (images(data), images(copy));
+        assert_eq!(here.len(), ANGLES.len() * PHASES);
+        assert!(there.iter().all(|(file, _)| file.is_file()), "{there:?}");
+        let sources = |images: &[(PathBuf, serde_json::Value)]| -> Vec<_> {
+            images.iter().map(|(_, source)| source.clone()).collect()
+        };
+        assert_eq!(sources(&here), sources(&there));
+    }
+    let said = run(&calibrate, true);
+    assert!(said.contains("references.json is not kept") && !copy.join("references.json").exists(), "{said}");
+}
+
 #[test]
 fn centrelines_lie_over_the_frames_of_the_runs() {
     let directory = tempfile::tempdir().unwrap();
@@ -77,6 +106,8 @@ fn centrelines_lie_over_the_frames_of_the_runs() {
     assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
     expect_valid(&state);
 
+    expect_kept_in_copies(&data, &at("copy"));
+
     // The name of another file, and runs of two studies.
     let said = run(&[&present[..], &[text(&at("state.json"))]].concat(), false);
     assert!(said.contains("--out") && said.contains(".dcm"), "{said}");
@@ -93,6 +124,9 @@ fn centrelines_lie_over_the_frames_of_the_runs() {
         let has = |secret: &str| bytes.windows(secret.len()).any(|part| part == secret.as_bytes());
         assert!(!has("ller^J") && !has("1.2.3.4.5") && !has("4711"), "{}", entry.display());
     }
+    let convert = ["convert", text(&data), "--layout", "native", "--keep-references", "-o"];
+    let said = run(&[&convert[..], &[text(&at("nothing"))]].concat(), false);
+    assert!(said.contains("nothing to keep") && !at("nothing").exists(), "{said}");
     let said = run(&[&present[..], &[text(&at("none.dcm"))]].concat(), false);
     assert!(said.contains("references.json") && said.contains("--keep-references"), "{said}");
 

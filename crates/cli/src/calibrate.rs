@@ -2,7 +2,7 @@
 
 use super::calibration_table;
 use super::options::choice;
-use super::output::{CALIBRATION, write_dataset};
+use super::output::{CALIBRATION, KeptReferences, write_dataset};
 use clap::Args;
 use nertca_vk::calibrate::calibrate;
 use nertca_vk::config::{CalibrateMode, Config, Preset};
@@ -28,6 +28,9 @@ pub struct CalibrateArgs {
     /// Replace a dataset that the directory already contains.
     #[arg(short, long)]
     pub force: bool,
+    /// Keep the references to the runs that `import dicom --keep-references` has written, which name the patient.
+    #[arg(long)]
+    pub keep_references: bool,
     /// Print JSON instead of a table.
     #[arg(long)]
     pub json: bool,
@@ -36,13 +39,16 @@ pub struct CalibrateArgs {
 /// Corrects a dataset.
 pub fn run(args: &CalibrateArgs) -> Result<()> {
     let dataset = Dataset::open(&args.data)?;
+    let references = KeptReferences::of(&dataset, args.keep_references)?;
     let mut config = Config::preset(Preset::Fast);
     config.calibrate.mode = args.mode;
     let calibration = write_dataset(&args.out, args.force, |out| {
         let calibration = calibrate(&dataset, &config)?;
         let corrected = dataset.corrected(&calibration)?;
         let description = format!("calibrated from {}", dataset.path.display());
-        writer::write(&corrected, Layout::Native, out, description, &|view| calibration.stated(view).cloned())?;
+        let stated = |view| calibration.stated(view).cloned();
+        let image_files = writer::write(&corrected, Layout::Native, out, description, &stated)?;
+        references.write(&image_files, out)?;
         let folder = out.join(CALIBRATION);
         files::create_directory(&folder)?;
         calibration.write(&folder)?;

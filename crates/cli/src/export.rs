@@ -2,7 +2,7 @@
 
 use super::data::bar;
 use super::options::{GlobalOptions, choice};
-use super::output::{Earlier, numbers_of_checkpoint, random_numbers, write_dataset};
+use super::output::{Earlier, KeptReferences, numbers_of_checkpoint, random_numbers, write_dataset};
 use clap::Args;
 use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
@@ -89,6 +89,9 @@ pub struct ConvertArgs {
     /// Replace a dataset that the directory already contains.
     #[arg(short, long)]
     pub force: bool,
+    /// Keep the references to the runs that `import dicom --keep-references` has written, which name the patient.
+    #[arg(long)]
+    pub keep_references: bool,
 }
 
 /// Returns the phases of a model that `--phase` names, and whether they are a sequence: all phases of an object that moves.
@@ -282,7 +285,11 @@ pub fn convert(args: &ConvertArgs) -> Result<()> {
     if args.layout == Layout::Nerfca && dataset.still {
         eprintln!("this layout cannot state that the object is at rest: phase 1 is the object without its vessels");
     }
-    write_dataset(&args.out, args.force, |out| convert_dataset(&dataset, args.layout, out))?;
+    let references = KeptReferences::of(&dataset, args.keep_references)?;
+    write_dataset(&args.out, args.force, |out| {
+        let image_files = convert_dataset(&dataset, args.layout, out)?;
+        references.write(&image_files, out)
+    })?;
     out!("{}", args.out.display());
     Ok(())
 }

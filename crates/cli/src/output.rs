@@ -7,9 +7,9 @@ use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use nertca_vk::fingerprint::Fingerprint;
 use nertca_vk::phantom::tree_file::TREE;
-use nertca_vk::scan::dataset::MANIFEST;
+use nertca_vk::scan::dataset::{Dataset, MANIFEST};
 use nertca_vk::scan::nerfca;
-use nertca_vk::scan::references::REFERENCES;
+use nertca_vk::scan::references::{REFERENCES, References};
 use nertca_vk::scan::truth::TRUTH;
 use nertca_vk::score::volume::VOLUMES;
 use std::ffi::OsStr;
@@ -77,6 +77,45 @@ fn files_of_dataset(directory: &Path) -> Result<Vec<PathBuf>> {
         found.extend(files_in(&directory.join(folder), |name| is_numbered(name, begin, end))?);
     }
     Ok(found)
+}
+
+/// References of a dataset to its runs, for a copy of it.
+pub struct KeptReferences<'a> {
+    dataset: &'a Dataset,
+    /// References to keep; none where they are not to be kept.
+    references: Option<References>,
+}
+
+impl<'a> KeptReferences<'a> {
+    /// Reads the references of a dataset if they are to be kept, and notes where they are not.
+    ///
+    /// # Errors
+    /// [`Error::Data`] where they are to be kept and the dataset has none; [`Error::Io`].
+    pub fn of(dataset: &'a Dataset, keep: bool) -> Result<KeptReferences<'a>> {
+        let references = match (References::read(&dataset.path)?, keep) {
+            (None, true) => {
+                let problem =
+                    "is missing, so that --keep-references has nothing to keep: import the runs with this option";
+                return Err(Error::data(dataset.path.join(REFERENCES), "file", problem));
+            }
+            (Some(_), false) => {
+                eprintln!("{REFERENCES} is not kept, because it names the patient; --keep-references keeps it");
+                None
+            }
+            (references, _) => references,
+        };
+        Ok(KeptReferences { dataset, references })
+    }
+
+    /// Writes the references into a copy of the dataset whose frames have these image files.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn write(&self, image_files: &[PathBuf], out: &Path) -> Result<()> {
+        let Some(references) = &self.references else { return Ok(()) };
+        let names = self.dataset.frames.iter().map(|frame| frame.name.as_str());
+        references.of_other_files(names.zip(image_files.iter().map(PathBuf::as_path))).write(out)
+    }
 }
 
 /// Writes a dataset into a directory by a function that gets the directory to write to. An earlier dataset there is refused, or
