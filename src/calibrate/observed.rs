@@ -96,6 +96,12 @@ pub(crate) fn coarsened_for_calibration(dataset: &Dataset) -> Dataset {
     coarsened(dataset, factor(dataset))
 }
 
+/// Returns the training frames of a dataset, binned as far as the smaller side of each image keeps `min_side` pixels.
+pub(crate) fn binned_to(dataset: &Dataset, min_side: usize) -> Dataset {
+    let sides = dataset.training_views().into_iter().flat_map(|view| dataset.views[view].size);
+    coarsened(dataset, (sides.min().unwrap_or(0) / min_side).max(1))
+}
+
 /// Bins the training frames.
 fn coarsened(dataset: &Dataset, factor: usize) -> Dataset {
     let frame =

@@ -5,6 +5,7 @@
 //! and from the calibration (how far the stated views disagreed), because corrections remove a part of an error only. The constants were
 //! fitted to phantoms with known vessels (`docs/performance.md`).
 
+use crate::calibrate::observed::binned_to;
 use crate::evidence::background::Background;
 use crate::evidence::series::Series;
 use crate::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
@@ -20,6 +21,8 @@ use glam::{DVec2, DVec3};
 /// Error of a view's image of a centreline, as a share of the distance to the ridges that [`CONFIDENCE`] of the points have: a point
 /// is the mean of several views, phases and neighbours.
 const OF_RIDGES: f64 = 0.45;
+/// Minimum smaller side, pixels, of the binned images whose ridges are compared.
+const RIDGE_SIDE: usize = 128;
 /// Error where there are no images to compare with, pixels.
 const WITHOUT_IMAGES_PX: f64 = 0.1;
 /// Exponent of the stated views' disagreement in the error that calibration leaves.
@@ -45,16 +48,17 @@ const EXISTENCE_SINGLE: [f64; 2] = [0.61, 0.997];
 
 /// States the doubt about all points of a tree. The dataset has the geometry that the reconstruction used, and
 /// `disagreement_px` is the disagreement of its views as stated ([`crate::calibrate::correction::Calibration::disagreement_px`]). A phase
-/// that the dataset does not have is compared with no image.
+/// that the dataset does not have is compared with no image. Large images are binned: in small pixels, noise moves the ridges.
 pub fn state_doubt(beat: &mut BeatTree, dataset: &Dataset, disagreement_px: f64) {
     let views = dataset.training_views();
     let Some(first) = views.first() else { return };
-    let pixel_mm = dataset.views[*first].rays.anchor[1].length() * MM_PER_UNIT;
+    let pixel_mm = |dataset: &Dataset| dataset.views[*first].rays.anchor[1].length() * MM_PER_UNIT;
+    let left_mm = left_by_calibration_mm(views.len(), disagreement_px * pixel_mm(dataset));
+    let dataset = &binned_to(dataset, RIDGE_SIDE);
     let backgrounds: Vec<Background> = Series::each(dataset).map(Background::new).collect();
     let shown: Vec<Vec<FrameView<'_>>> =
         beat.phases.iter().map(|tree| frame_views(tree, dataset, &backgrounds, beat.resolution_mm)).collect();
-    let from_images_mm = pixel_mm * image_error_px(&beat.phases, &shown);
-    let left_mm = left_by_calibration_mm(views.len(), disagreement_px * pixel_mm);
+    let from_images_mm = pixel_mm(dataset) * image_error_px(&beat.phases, &shown);
     let scale = Scale { image_mm: from_images_mm.hypot(left_mm), n_views: views.len() };
     let reference = beat.phases.iter().find(|tree| Some(tree.phase) == beat.reference_phase).cloned();
     for (tree, shown) in beat.phases.iter_mut().zip(&shown) {
