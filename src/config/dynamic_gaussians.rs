@@ -69,8 +69,8 @@ section! {
         /// Interval, in iterations, at which the static background is estimated again from the images minus the Gaussians; not
         /// while rates fall; 0 = never.
         background_every: u32 in 0.0 to 1e6,
-        /// Number of fits with different seeds whose mean is the dynamic field; 0 = three where images are noisy or views were adjusted,
-        /// five with two views, else one; 1 is the default for older files without this setting.
+        /// Number of fits with different seeds whose mean is the dynamic field; 0 = three where images are noisy, views were adjusted, or
+        /// blades hide much of three views, five with two views, else one; 1 is the default for older files without this setting.
         #[serde(default = "one_fit")] fits: u32 in 0.0 to 9.0,
         /// Leave out a catheter: Gaussians of a deformable set whose motion ends along a line.
         #[serde(default)] without_catheter: bool,

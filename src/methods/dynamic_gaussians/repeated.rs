@@ -15,6 +15,10 @@ const NEXT_SEED: u32 = 1000;
 const MEAN_FACTOR: f64 = 4.0 / 3.0;
 /// Number of fits to noisy or inconsistent images. The mean of fits to good images is broader than each of them.
 const FITS: u32 = 3;
+/// Number of views up to which several fits are made where blades hide much.
+const FEW_VIEWS: usize = 3;
+/// Share of hidden pixels from which on blades hide much.
+const HIDDEN: f64 = 0.3;
 /// Number of fits to two views, which leave alternatives: places that few fits find are often false crossings.
 const FITS_TO_TWO_VIEWS: u32 = 5;
 
@@ -27,11 +31,21 @@ impl Targets {
                 Some("because two views leave alternatives, and places that few fits find are often false"),
             ),
             0 if self.is_noisy() => (FITS, Some("because the images are noisy")),
+            0 if self.n_views <= FEW_VIEWS && self.hidden_share() >= HIDDEN => {
+                (FITS, Some("because blades hide much of the few views"))
+            }
             // Only an adjustment of views finds contrasts of frames.
             0 if self.contrast.iter().any(|c| *c != 1.0) => (FITS, Some("because the views had to be adjusted")),
             0 | 1 => (1, None),
             n => (n, Some("as gaussians.fits says")),
         }
+    }
+
+    /// Returns the share of the pixels of all images that blades hide.
+    fn hidden_share(&self) -> f64 {
+        let hidden = |image: usize| self.weight.image(image).iter().filter(|weight| **weight == 0.0).count();
+        let all = self.n_images * self.n_pixels();
+        (0..self.n_images).map(hidden).sum::<usize>() as f64 / all.max(1) as f64
     }
 }
 
@@ -183,4 +197,34 @@ fn mean(fields: &[DynamicGaussians]) -> Result<DynamicGaussians> {
 /// Returns the settings of a fit that is followed by so many others.
 fn seeded(config: &Config, left: u32) -> Config {
     Config { seed: config.seed.wrapping_add(NEXT_SEED * left), ..config.clone() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::methods::dynamic_gaussians::test_targets::{PHASES, SIDE, targets};
+
+    #[test]
+    fn few_views_noise_and_blades_ask_for_several_fits() {
+        // Views, noise, columns that are hidden in each image, contrast of the first image, expected fits.
+        for (n_views, noise, hidden, contrast, expected) in [
+            (2, 0.01, 0, 1.0, FITS_TO_TWO_VIEWS),
+            (3, 0.01, 0, 1.0, 1),
+            (4, 0.2, 0, 1.0, FITS),
+            (3, 0.01, SIDE / 5, 1.0, 1),
+            (3, 0.01, SIDE / 2, 1.0, FITS),
+            (4, 0.01, SIDE / 2, 1.0, 1),
+            (4, 0.01, 0, 0.9, FITS),
+        ] {
+            let mut targets = targets(&vec![0.0; n_views * PHASES * SIDE * SIDE], n_views);
+            targets.noise.fill(noise);
+            targets.contrast[0] = contrast;
+            let pixels = (0..targets.n_images * SIDE * SIDE).filter(|pixel| pixel % SIDE < hidden);
+            pixels.for_each(|pixel| targets.weight[pixel] = 0.0);
+            let case = format!("{n_views} views, noise {noise}, {hidden} columns hidden, contrast {contrast}");
+            let (fits, reason) = targets.fits(0);
+            assert_eq!((fits, reason.is_some()), (expected, expected > 1), "{case}");
+            assert_eq!(targets.fits(1), (1, None), "a stated number of fits is kept: {case}");
+        }
+    }
 }
