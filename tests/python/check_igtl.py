@@ -21,5 +21,19 @@ assert np.allclose(steps / lengths, place.matrix[:3, :3] * np.sign((steps * plac
 assert np.allclose((steps / lengths)[:, :2], place.matrix[:3, :2], atol=1e-5)
 middle = picture.ijk_to_world_matrix @ [127.5, 127.5, 0, 1]
 assert np.allclose(middle[:3], place.matrix[:3, 3], atol=1e-3), (middle, place.matrix)
+
+# The picture follows the C-arm of a client.
+primary, secondary = np.radians([20.0, -25.0])
+away = np.array([-np.cos(secondary) * np.sin(primary), np.cos(secondary) * np.cos(primary), np.sin(secondary)])
+wanted = np.eye(4)
+wanted[:3, 2] = away
+client.send_message(pyigtl.TransformMessage(wanted, device_name="CArm"), wait=True)
+for _ in range(400):
+    moved = client.wait_for_message("CArm", timeout=60)
+    if np.allclose(moved.matrix[:3, 2], away, atol=1e-4):
+        break
+else:
+    sys.exit(f"the picture stays at {moved.matrix[:3, 2]}, not {away}")
+assert not np.allclose(place.matrix[:3, 2], away, atol=0.1), "another direction than before"
 client.stop()
 print("pyigtl: an overlay of", picture.image.shape, "at", place.matrix[:3, 3])

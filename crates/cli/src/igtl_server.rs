@@ -1,12 +1,12 @@
 //! OpenIGTLink for `watch`: the overlay, its place in space and the vessels, to any number of clients. A slow client misses pictures; it
-//! delays neither the others nor the training.
+//! delays neither the others nor the training. A client that sends the place of its C-arm gets the picture from there, as all others do.
 
 use super::view_server::PictureSource;
 use super::view_tree::TreeWork;
 use glam::{DMat3, DVec3};
 use nertca_vk::error::{Error, Result};
-use nertca_vk::formats::igtl::{self, Picture, ras};
-use nertca_vk::geometry::{MM_PER_UNIT, ViewRays, lps_mm_from_world};
+use nertca_vk::formats::igtl::{self, Picture, Received, ras};
+use nertca_vk::geometry::{MM_PER_UNIT, ViewRays, angles_deg_of, lps_mm_from_world, world_from_lps_mm};
 use nertca_vk::model::component::Component;
 use nertca_vk::render::quantity::{Projection, Quantity};
 use serde::Deserialize;
@@ -28,6 +28,10 @@ const MAX_CLIENTS: usize = 16;
 const MAX_READS: usize = 16;
 /// Columns and rows of the overlay.
 const SIDE: u16 = 256;
+/// Maximum deviation of the length of a direction that a client sends from 1.
+const UNIT_WITHIN: f64 = 0.05;
+/// Type of the message with the place of a C-arm.
+const TRANSFORM: &str = "TRANSFORM";
 /// Names of the devices.
 const OVERLAY: &str = "Overlay";
 const C_ARM: &str = "CArm";
@@ -46,6 +50,8 @@ struct Newest {
 struct Shared {
     newest: Mutex<Newest>,
     changed: Condvar,
+    /// Primary and secondary angle of the pictures, deg; those of the first view where no client has sent a C-arm.
+    angles_deg: Mutex<Option<[f64; 2]>>,
     clients: AtomicUsize,
     ended: AtomicBool,
 }
@@ -55,8 +61,24 @@ impl Shared {
         self.newest.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    fn angles_deg(&self) -> MutexGuard<'_, Option<[f64; 2]>> {
+        self.angles_deg.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     fn has_ended(&self) -> bool {
         self.ended.load(Ordering::Acquire)
+    }
+
+    /// Draws the pictures from the place of a C-arm that a client has sent; other messages are ignored.
+    fn follow(&self, message: &Received) {
+        if message.kind != TRANSFORM || message.device != C_ARM {
+            return;
+        }
+        let angles_deg = igtl::read_transform(&message.content).and_then(|[_, _, away, _]| angles_along(away));
+        match angles_deg {
+            Some(_) => *self.angles_deg() = angles_deg,
+            None => tracing::warn!("OpenIGTLink: a {TRANSFORM} {C_ARM} is ignored: its third column is no direction"),
+        }
     }
 }
 
@@ -141,6 +163,7 @@ fn serve(mut stream: TcpStream, shared: &Shared) -> std::io::Result<()> {
     stream.set_write_timeout(Some(SENT_WITHIN))?;
     // The newest picture may be older than the connection.
     let mut sent = shared.newest().number;
+    let mut reader = igtl::Reader::default();
     loop {
         let bytes = {
             let unchanged = |newest: &mut Newest| newest.number == sent && !shared.has_ended();
@@ -156,14 +179,16 @@ fn serve(mut stream: TcpStream, shared: &Shared) -> std::io::Result<()> {
         if let Some(bytes) = bytes {
             stream.write_all(&bytes)?;
         }
-        if !drain(&mut stream)? {
+        let is_there = receive(&mut stream, &mut reader)?;
+        std::iter::from_fn(|| reader.next_message()).for_each(|message| shared.follow(&message));
+        if !is_there {
             return Ok(());
         }
     }
 }
 
-/// Discards what a client has sent lately; returns whether it is still there.
-fn drain(stream: &mut TcpStream) -> std::io::Result<bool> {
+/// Takes what a client has sent lately; returns whether it is still there.
+fn receive(stream: &mut TcpStream, reader: &mut igtl::Reader) -> std::io::Result<bool> {
     let mut room = [0; 4096];
     stream.set_nonblocking(true)?;
     let mut there = Ok(true);
@@ -171,7 +196,10 @@ fn drain(stream: &mut TcpStream) -> std::io::Result<bool> {
     for _ in 0..MAX_READS {
         match stream.read(&mut room) {
             Ok(0) => there = Ok(false),
-            Ok(_) => continue,
+            Ok(n) => {
+                reader.push(&room[..n]);
+                continue;
+            }
             Err(error) if error.kind() == ErrorKind::WouldBlock => {}
             Err(error) => there = Err(error),
         }
@@ -227,7 +255,7 @@ impl Beat {
                 self.look_for_vessels();
                 looked = Instant::now();
             }
-            match self.picture(phase) {
+            match self.picture(phase, *shared.angles_deg()) {
                 Ok(bytes) => {
                     let mut newest = shared.newest();
                     *newest = Newest { number: newest.number + 1, bytes: Arc::new(bytes) };
@@ -269,11 +297,13 @@ impl Beat {
         }
     }
 
-    /// Returns the messages of a phase: the place of the C-arm, the overlay and the vessels.
-    fn picture(&self, phase: u32) -> Result<Vec<u8>> {
+    /// Returns the messages of a phase: the place of the C-arm, the overlay and the vessels. Pictures are those of the first view where no
+    /// angles are given.
+    fn picture(&self, phase: u32, angles_deg: Option<[f64; 2]>) -> Result<Vec<u8>> {
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let taken = self.source.taken()?;
-        let rays = taken.turned(taken.c_arm.primary_deg, taken.c_arm.secondary_deg, usize::from(SIDE))?;
+        let [primary_deg, secondary_deg] = angles_deg.unwrap_or([taken.c_arm.primary_deg, taken.c_arm.secondary_deg]);
+        let rays = taken.turned(primary_deg, secondary_deg, usize::from(SIDE))?;
         let quantity = Quantity { component: Component::Dynamic, projection: Projection::Drr };
         let values = self.source.render(&rays, usize::from(SIDE), phase, quantity)?;
         let [axes, steps_mm] = placed(&rays);
@@ -283,7 +313,7 @@ impl Beat {
             steps_mm: [steps_mm[0], steps_mm[1]],
             middle_mm: middle_mm(&rays),
         };
-        let mut out = igtl::message("TRANSFORM", C_ARM, now, &igtl::transform(axes, picture.middle_mm));
+        let mut out = igtl::message(TRANSFORM, C_ARM, now, &igtl::transform(axes, picture.middle_mm));
         out.extend(igtl::message("IMAGE", OVERLAY, now, &igtl::image(&picture)));
         if let Some(body) = self.lines(phase) {
             out.extend(igtl::message("POLYDATA", VESSELS, now, &body));
@@ -308,6 +338,13 @@ fn placed(rays: &ViewRays) -> [[DVec3; 3]; 2] {
     let away = ras(lps_mm_from_world(rays.axis()) / MM_PER_UNIT);
     let axes = DMat3::from_cols(across.normalize_or(DVec3::X), down.normalize_or(DVec3::Y), away);
     [[axes.x_axis, axes.y_axis, axes.z_axis], [across, down, away]]
+}
+
+/// Returns the primary and the secondary angle, deg, of a C-arm whose detector lies in a direction from its source, RAS; `None` for a vector
+/// that is far from a unit one.
+fn angles_along(away: DVec3) -> Option<[f64; 2]> {
+    let is_direction = (away.length() - 1.0).abs() < UNIT_WITHIN;
+    is_direction.then(|| angles_deg_of(world_from_lps_mm(ras(away)).normalize_or_zero()))
 }
 
 /// Returns the middle of a picture in the plane through the isocentre, RAS mm.
