@@ -143,6 +143,7 @@ impl Dataset {
             Error::config(FILE, what, "does not agree with the dataset: the correction was made for other data")
         };
         let mut corrected = self.clone();
+        corrected.views_adjusted |= calibration.adjustment.as_ref().is_some_and(|adjustment| adjustment.accepted);
         for c in &calibration.views {
             let view = corrected.views.get_mut(c.view).filter(|view| view.geometry == c.stated);
             let view = view.ok_or_else(|| other(format!("view {}", c.view)))?;

@@ -231,6 +231,7 @@ mod tests {
             hidden: Default::default(),
             vessel_attenuation: None,
             still: false,
+            views_adjusted: false,
             prior: None,
         }
     }

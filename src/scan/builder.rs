@@ -153,6 +153,7 @@ impl Builder {
             depth_range: self.depth_range,
             vessel_attenuation: self.vessel_attenuation,
             still: self.still,
+            views_adjusted: false,
             prior: None,
             notes: self.notes,
         };

@@ -232,6 +232,8 @@ pub struct Dataset {
     pub vessel_attenuation: Option<f64>,
     /// Whether the object is at rest: phase 0 shows it, and phase 1 is the same without vessels.
     pub still: bool,
+    /// Whether the geometry of the views was adjusted with the vessels in the loop.
+    pub views_adjusted: bool,
     /// Vessels that are known before the images are read.
     pub prior: Option<Arc<VesselPrior>>,
     /// Findings on reading that are no errors but may be unintended.

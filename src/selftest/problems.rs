@@ -82,6 +82,7 @@ pub fn small_dataset(width: usize, height: usize, n_phases: u32) -> Result<Datas
         hidden: Default::default(),
         vessel_attenuation: Some(1.0),
         still: false,
+        views_adjusted: false,
         prior: None,
         notes: Vec::new(),
     })
@@ -191,6 +192,7 @@ pub fn targets(width: usize, height: usize, n_phases: usize) -> Result<Targets> 
         images: all.clone().map(|i| 1.0 + wave(i, 0.37)).collect(),
         max: Some(all.clone().map(|i| 1.0 + wave(i, 0.37)).collect()),
         contrast_comes_and_goes: false,
+        views_adjusted: false,
         places: vec![Vec::new(); n_phases],
         cell: 1.0,
     })

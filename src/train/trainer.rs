@@ -367,6 +367,7 @@ mod tests {
             hidden: Default::default(),
             vessel_attenuation: None,
             still: false,
+            views_adjusted: false,
             prior: None,
         }
     }

@@ -156,6 +156,7 @@ impl Studio {
             hidden: Default::default(),
             vessel_attenuation: Some(Tissues::XCAT.vessel * 100.0),
             still: false,
+            views_adjusted: false,
             prior: None,
             notes: Vec::new(),
         }

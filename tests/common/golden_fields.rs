@@ -63,6 +63,7 @@ impl Golden {
             height,
             n_phases: phases,
             still: false,
+            views_adjusted: false,
             prior: None,
             depth_range: (-self.number("depth"), self.number("depth")),
             hidden: Default::default(),

@@ -128,6 +128,7 @@ mod tests {
             lengths: Lengths { factor: 4.0, smoothing: 1.2 },
             rest_phase: 1,
             contrast_comes_and_goes: false,
+            views_adjusted: false,
             places: vec![
                 vec![PossibleVessel { position: DVec3::new(4.0, 6.0, -8.0), evidence: 9.0, far_from_prior: 0.0 }],
                 Vec::new(),

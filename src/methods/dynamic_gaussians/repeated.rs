@@ -34,8 +34,7 @@ impl Targets {
             0 if self.n_views <= FEW_VIEWS && self.hidden_share() >= HIDDEN => {
                 (FITS, Some("because blades hide much of the few views"))
             }
-            // Only an adjustment of views finds contrasts of frames.
-            0 if self.contrast.iter().any(|c| *c != 1.0) => (FITS, Some("because the views had to be adjusted")),
+            0 if self.views_adjusted => (FITS, Some("because the views had to be adjusted")),
             0 | 1 => (1, None),
             n => (n, Some("as gaussians.fits says")),
         }
@@ -206,22 +205,24 @@ mod tests {
 
     #[test]
     fn few_views_noise_and_blades_ask_for_several_fits() {
-        // Views, noise, columns that are hidden in each image, contrast of the first image, expected fits.
-        for (n_views, noise, hidden, contrast, expected) in [
-            (2, 0.01, 0, 1.0, FITS_TO_TWO_VIEWS),
-            (3, 0.01, 0, 1.0, 1),
-            (4, 0.2, 0, 1.0, FITS),
-            (3, 0.01, SIDE / 5, 1.0, 1),
-            (3, 0.01, SIDE / 2, 1.0, FITS),
-            (4, 0.01, SIDE / 2, 1.0, 1),
-            (4, 0.01, 0, 0.9, FITS),
+        // Views, noise, columns that are hidden in each image, whether the views were adjusted, expected fits.
+        for (n_views, noise, hidden, adjusted, expected) in [
+            (2, 0.01, 0, false, FITS_TO_TWO_VIEWS),
+            (3, 0.01, 0, false, 1),
+            (4, 0.2, 0, false, FITS),
+            (3, 0.01, SIDE / 5, false, 1),
+            (3, 0.01, SIDE / 2, false, FITS),
+            (4, 0.01, SIDE / 2, false, 1),
+            (4, 0.01, 0, true, FITS),
         ] {
             let mut targets = targets(&vec![0.0; n_views * PHASES * SIDE * SIDE], n_views);
             targets.noise.fill(noise);
-            targets.contrast[0] = contrast;
+            targets.views_adjusted = adjusted;
+            // Calibration finds contrasts as well.
+            targets.contrast[0] = 0.9;
             let pixels = (0..targets.n_images * SIDE * SIDE).filter(|pixel| pixel % SIDE < hidden);
             pixels.for_each(|pixel| targets.weight[pixel] = 0.0);
-            let case = format!("{n_views} views, noise {noise}, {hidden} columns hidden, contrast {contrast}");
+            let case = format!("{n_views} views, noise {noise}, {hidden} columns hidden, adjusted {adjusted}");
             let (fits, reason) = targets.fits(0);
             assert_eq!((fits, reason.is_some()), (expected, expected > 1), "{case}");
             assert_eq!(targets.fits(1), (1, None), "a stated number of fits is kept: {case}");

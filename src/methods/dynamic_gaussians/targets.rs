@@ -73,6 +73,8 @@ pub struct Targets {
     pub rest_phase: usize,
     /// True where some phase shows so much less than others that contrast must have come or gone meanwhile.
     pub contrast_comes_and_goes: bool,
+    /// Whether the geometry of the views was adjusted with the vessels in the loop.
+    pub views_adjusted: bool,
     /// Cells of the hull, per phase.
     pub places: Vec<Vec<PossibleVessel>>,
     /// Side of a cell, pixels at the isocentre.
@@ -150,6 +152,7 @@ impl Targets {
             lengths: Lengths { factor: 1.0, smoothing: 1.0 },
             rest_phase: 0,
             contrast_comes_and_goes: false,
+            views_adjusted: dataset.views_adjusted,
             places: Vec::new(),
             cell: motion.hull.cell / units.pixel,
         };

@@ -46,6 +46,7 @@ pub fn targets(images: &[f32], n_views: usize) -> Targets {
         lengths: Lengths { factor: 1.0, smoothing: 1.0 },
         rest_phase: 0,
         contrast_comes_and_goes: false,
+        views_adjusted: false,
         places: vec![Vec::new(); PHASES],
         cell: 1.0,
     }
