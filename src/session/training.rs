@@ -53,9 +53,10 @@ impl Shared {
         let fresh = Plan::new(&config, &dataset)?;
         let repeats = fresh.fits(&refining_config) > fresh.fits(&config);
         let mut earlier = None;
+        let unrefined = engine.unrefined.take();
         if let Some(training) = &mut engine.training {
             // Fits with other frames cannot go on from the mean of several, nor from one to views that are calibrated anew.
-            let mut state = match engine.unrefined.take() {
+            let mut state = match unrefined {
                 Some(state) => state,
                 None => training.trainer_mut().checkpoint()?,
             };
