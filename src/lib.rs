@@ -245,6 +245,7 @@ pub mod vessels {
 
 /// Vessels as trees of centrelines with radii, followed over the beat.
 pub mod trees {
+    pub mod areas;
     mod branches;
     pub mod doubt;
     pub mod extract;
@@ -262,6 +263,7 @@ pub mod trees {
     mod refine;
     mod ridges;
     mod sampled;
+    mod shadows;
     pub mod sight;
     mod solid;
     mod tidy;

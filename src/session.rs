@@ -31,6 +31,7 @@ use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::at_rest;
 use crate::scan::gating::{BeatTime, RPeaks};
 use crate::scan::prior::VesselPrior;
+use crate::trees::areas::measure_radii;
 use crate::trees::doubt::state_doubt;
 use crate::trees::extract::{TreeOptions, vessel_trees};
 use crate::trees::tree::{BeatTree, TreeView};
@@ -541,6 +542,9 @@ impl Session {
         match dataset.and_then(|(dataset, _)| dataset.corrected(&calibration)) {
             Ok(dataset) if dataset.n_phases as usize == beat.phases.len() => {
                 beat.views = TreeView::of(&dataset);
+                if let Err(reason) = measure_radii(beat, &dataset) {
+                    tracing::info!("the radii of vessels are those of the field: {reason}");
+                }
                 state_doubt(beat, &dataset, calibration.disagreement_px);
             }
             Ok(_) => tracing::warn!("doubt is not stated: the frames have another number of phases than the field"),

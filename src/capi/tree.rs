@@ -134,7 +134,7 @@ fn lesions_of(found: &BeatTree) -> Vec<nertca_lesion> {
             min_diameter_mm: lesion.min_diameter_mm,
             reference_diameter_mm: lesion.reference_diameter_mm,
         };
-        all.extend(lesions(tree, found.resolution_mm).into_iter().map(row));
+        all.extend(lesions(tree, found.measurement()).into_iter().map(row));
         first += tree.branches.len();
     }
     all

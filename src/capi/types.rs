@@ -365,7 +365,8 @@ pub struct nertca_tree {
     pub branch_points: *mut u32,
     /// Points of the centrelines (LPS), mm; three numbers each.
     pub points_mm: *mut f64,
-    /// Radius of the vessel at each point, mm.
+    /// Radius of the vessel at each point, mm: as the frames show it where they are known and the options state the attenuation of vessels, else as
+    /// the field does.
     pub radius_mm: *mut f64,
     /// Half width of the interval that contains the true centreline with a probability of 68 %, along the least certain direction across the
     /// vessel, for each point, mm. This array and the next two may be null, and have room for `points` elements otherwise. They hold NaN where

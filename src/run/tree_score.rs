@@ -59,7 +59,7 @@ fn lesion_scores(
         Some(TruePlace { lesion: lesion.clone(), place_mm })
     };
     let places: Option<Vec<TruePlace>> = taken.lesions.iter().map(place).collect();
-    Some(lesions::score(tree, beat.resolution_mm, &places?))
+    Some(lesions::score(tree, beat.measurement(), &places?))
 }
 
 /// Returns the narrowest place of a true stenosis in the tree `now`, LPS mm; its position is stated along the branch at rest. `None` for a

@@ -3,7 +3,7 @@
 use crate::scan::truth::TrueLesion;
 use crate::score::dice::mean;
 use crate::trees::lesions::{Lesion, lesions};
-use crate::trees::tree::PhaseTree;
+use crate::trees::tree::{Measurement, PhaseTree};
 use glam::DVec3;
 use serde::Serialize;
 
@@ -46,10 +46,10 @@ pub struct LesionScores {
     pub severe_false_lesions: usize,
 }
 
-/// Scores the stenoses that are found in a tree, extracted from a field of a resolution, mm. Each true stenosis is compared with the nearest
+/// Scores the stenoses that are found in a tree. Each true stenosis is compared with the nearest
 /// one of ours that no other true one is nearer to.
-pub fn score(tree: &PhaseTree, resolution_mm: f64, truth: &[TruePlace]) -> LesionScores {
-    let ours = lesions(tree, resolution_mm);
+pub fn score(tree: &PhaseTree, measurement: Measurement, truth: &[TruePlace]) -> LesionScores {
+    let ours = lesions(tree, measurement);
     let place = |lesion: &Lesion| tree.branches[lesion.branch].points_mm[lesion.point];
     let mut pairs: Vec<(f64, usize, usize)> = Vec::new();
     for (t, true_place) in truth.iter().enumerate() {
@@ -83,7 +83,9 @@ pub fn score(tree: &PhaseTree, resolution_mm: f64, truth: &[TruePlace]) -> Lesio
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trees::tree::Branch;
+    use crate::trees::tree::{Branch, RadiiFrom};
+
+    const MEASUREMENT: Measurement = Measurement { resolution_mm: 1.0, radii_from: RadiiFrom::Field };
 
     /// A vessel of 3 mm along superior, narrowed at places, mm, to shares of its diameter.
     fn narrowed(at: &[(f64, f64)]) -> PhaseTree {
@@ -117,7 +119,7 @@ mod tests {
         // One is right, one far too mild, one is missed, and a severe one is false.
         let tree = narrowed(&[(30.0, 0.4), (70.0, 0.6), (110.0, 0.3)]);
         let truth = [true_place(31.0, 60.0), true_place(70.0, 70.0), true_place(90.0, 50.0)];
-        let scores = score(&tree, 1.0, &truth);
+        let scores = score(&tree, MEASUREMENT, &truth);
         assert_eq!(
             (scores.phase, scores.true_lesions, scores.found, scores.within_10_points),
             (2, 3, 2, 1),
@@ -131,9 +133,9 @@ mod tests {
 
     #[test]
     fn one_stenosis_is_not_found_twice_and_a_healthy_tree_has_none() {
-        let scores = score(&narrowed(&[(50.0, 0.4)]), 1.0, &[true_place(48.0, 60.0), true_place(51.0, 60.0)]);
+        let scores = score(&narrowed(&[(50.0, 0.4)]), MEASUREMENT, &[true_place(48.0, 60.0), true_place(51.0, 60.0)]);
         assert_eq!((scores.found, scores.false_lesions), (1, 0));
-        let scores = score(&narrowed(&[]), 1.0, &[]);
+        let scores = score(&narrowed(&[]), MEASUREMENT, &[]);
         assert_eq!((scores.true_lesions, scores.found, scores.false_lesions), (0, 0, 0));
         assert_eq!((scores.min_radius_error_mm, scores.percent_absolute_error), (None, None));
     }

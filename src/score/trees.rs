@@ -325,7 +325,7 @@ impl Images<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trees::tree::Branch;
+    use crate::trees::tree::{Branch, RadiiFrom};
 
     fn beat(reference_phase: Option<u32>) -> BeatTree {
         let line = |phase: u32| (0..3).map(|i| DVec3::new(f64::from(i), f64::from(phase * phase), 0.0)).collect();
@@ -344,6 +344,8 @@ mod tests {
             spacing_mm: 1.0,
             views: Vec::new(),
             phases,
+            vessel_per_mm: None,
+            radii_from: RadiiFrom::Field,
             measured_mm: Vec::new(),
         }
     }

@@ -16,7 +16,7 @@ use crate::trees::refine::{Centring, STEP, evenly, from_voxels};
 use crate::trees::sampled::SampledField;
 use crate::trees::solid::make_solid;
 use crate::trees::tidy::{bridge_gaps, drop_specks, prune_spurs};
-use crate::trees::tree::{BeatTree, Branch, PhaseTree};
+use crate::trees::tree::{BeatTree, Branch, PhaseTree, RadiiFrom};
 use crate::vessels::centreline::centreline;
 use crate::vessels::distances::DistanceMap;
 use crate::vessels::field::{Corners, VesselField};
@@ -85,11 +85,14 @@ pub fn vessel_trees(
             progress(phases.len() as u64, all)?;
         }
     }
+    let is_filled_over_time = deformable.is_some_and(|set| set.filling.is_some());
     Ok(BeatTree {
         reference_phase: deformable.map(|tree| tree.setup.rest_phase),
         threshold_per_mm: finder.threshold_per_mm,
         resolution_mm: finder.resolution_mm,
         spacing_mm: finder.spacing_mm,
+        vessel_per_mm: finder.vessel_per_mm().filter(|_| !is_filled_over_time),
+        radii_from: RadiiFrom::Field,
         views: Vec::new(),
         phases,
         measured_mm,

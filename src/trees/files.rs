@@ -6,7 +6,7 @@ use crate::formats::swc;
 use crate::formats::vtp::{self, Values};
 use crate::trees::lesions::{Lesion, MeasuredBeat, lesions};
 use crate::trees::sight::TreeInView;
-use crate::trees::tree::{BeatTree, Branch, Doubt, PhaseTree, TreeView};
+use crate::trees::tree::{BeatTree, Branch, Doubt, PhaseTree, RadiiFrom, TreeView};
 use crate::trees::tubes::to_glb;
 use glam::DVec3;
 use serde::Serialize;
@@ -56,6 +56,7 @@ struct TreeFile {
     threshold_per_mm: f64,
     resolution_mm: f64,
     spacing_mm: f64,
+    radii_from: RadiiFrom,
     phases: Vec<PhaseRow>,
 }
 
@@ -248,7 +249,7 @@ fn write_phases(
 pub fn to_json(beat: &BeatTree) -> Result<String> {
     let measured = MeasuredBeat::new(beat);
     let phases = beat.phases.iter().map(|tree| {
-        let found = lesions(tree, beat.resolution_mm);
+        let found = lesions(tree, beat.measurement());
         // Views are needed for lesions only.
         let views = if found.is_empty() { Vec::new() } else { in_views(beat, tree) };
         PhaseRow {
@@ -271,6 +272,7 @@ pub fn to_json(beat: &BeatTree) -> Result<String> {
         threshold_per_mm: beat.threshold_per_mm,
         resolution_mm: beat.resolution_mm,
         spacing_mm: beat.spacing_mm,
+        radii_from: beat.radii_from,
         phases: phases.collect(),
     };
     serde_json::to_string(&file).map_err(|e| Error::Internal(e.to_string()))
@@ -381,6 +383,8 @@ mod tests {
             spacing_mm: 0.25,
             views: Vec::new(),
             phases,
+            vessel_per_mm: None,
+            radii_from: RadiiFrom::Field,
             measured_mm: Vec::new(),
         }
     }

@@ -1,7 +1,7 @@
 //! Stenoses: places where a vessel is narrower than its course elsewhere lets expect.
 
 use crate::linear::Pentadiagonal;
-use crate::trees::tree::{BeatTree, PhaseTree};
+use crate::trees::tree::{BeatTree, Measurement, PhaseTree, RadiiFrom};
 use glam::DVec3;
 use std::f64::consts::TAU;
 
@@ -27,8 +27,10 @@ const START_POINTS: usize = 6;
 const MIN_LENGTH: f64 = 1.4;
 /// Lower bound of an area without the blur, as a share of the measured one.
 const MIN_AREA: f64 = 0.5;
-/// Minimum reference diameter, in units of the field's resolution: whether a thinner vessel is narrowed cannot be told.
+/// Minimum reference diameter, in units of the field's resolution, where radii are those of the field and where they are those of the images:
+/// whether a thinner vessel is narrowed cannot be told.
 const MIN_REFERENCE: f64 = 1.0;
+const MIN_REFERENCE_IN_IMAGES: f64 = 0.5;
 
 /// A place where a vessel is narrowed.
 #[derive(Debug, Clone, PartialEq)]
@@ -88,15 +90,15 @@ struct Course {
     radius_mm: Vec<f64>,
 }
 
-/// Finds the stenoses of a tree that was extracted from a field of a resolution, mm.
+/// Finds the stenoses of a tree.
 ///
-/// Branches are joined to vessels that continue through bifurcations. The field's blur along a vessel is taken out of its area to
-/// second order: A - sigma^2 / 2 A''. The reference is the smooth line of asymmetric least squares (Eilers and Boelens, Baseline
+/// Branches are joined to vessels that continue through bifurcations. Where radii are those of the field, its blur along a vessel is
+/// taken out of the area to second order: A - sigma^2 / 2 A''. The reference is the smooth line of asymmetric least squares (Eilers and Boelens, Baseline
 /// correction with asymmetric least squares smoothing, 2005) through the radii: narrowings hardly lower it. Where the vessel is
 /// nowhere as wide on one of the sides, the reference is the greatest radius of that side. A lesion is a part
 /// whose diameter is below nine tenths of the reference, and somewhere [`MIN_PERCENT`] or more below it.
-pub fn lesions(tree: &PhaseTree, resolution_mm: f64) -> Vec<Lesion> {
-    straight_vessels(tree, resolution_mm).into_iter().flat_map(|vessel| vessel.lesions).collect()
+pub fn lesions(tree: &PhaseTree, measurement: Measurement) -> Vec<Lesion> {
+    straight_vessels(tree, measurement).into_iter().flat_map(|vessel| vessel.lesions).collect()
 }
 
 /// Vessels of each phase of a beat with the diameters that the field of the phase has, where points are followed.
@@ -112,7 +114,7 @@ impl MeasuredBeat {
             let mut measured = tree.clone();
             let branches = measured.branches.iter_mut().zip(radii_mm);
             branches.for_each(|(branch, radius_mm)| branch.radius_mm.clone_from(radius_mm));
-            straight_vessels(&measured, beat.resolution_mm)
+            straight_vessels(&measured, Measurement { radii_from: RadiiFrom::Field, ..beat.measurement() })
         };
         MeasuredBeat { phases: beat.phases.iter().zip(&beat.measured_mm).map(vessels).collect() }
     }
@@ -129,8 +131,8 @@ impl MeasuredBeat {
 
 /// Returns the vessels of a tree with their diameters and stenoses, as [`lesions`] judges them; vessels that are too short to be judged are
 /// left out.
-pub fn straight_vessels(tree: &PhaseTree, resolution_mm: f64) -> Vec<StraightVessel> {
-    courses(tree).into_iter().filter_map(|course| course.judged(resolution_mm)).collect()
+pub fn straight_vessels(tree: &PhaseTree, measurement: Measurement) -> Vec<StraightVessel> {
+    courses(tree).into_iter().filter_map(|course| course.judged(measurement)).collect()
 }
 
 /// Joins the branches of a tree to courses. Each branch belongs to one.
@@ -197,14 +199,18 @@ impl Course {
         along_mm
     }
 
-    fn judged(self, resolution_mm: f64) -> Option<StraightVessel> {
+    fn judged(self, Measurement { resolution_mm, radii_from }: Measurement) -> Option<StraightVessel> {
+        let (blur, min_reference) = match radii_from {
+            RadiiFrom::Field => (BLUR, MIN_REFERENCE),
+            RadiiFrom::Images => (0.0, MIN_REFERENCE_IN_IMAGES),
+        };
         let n = self.places.len();
         if n < 3 {
             return None;
         }
         let (start_mm, end_mm) = (self.along_mm[0], self.along_mm[n - 1]);
         let step_mm = (end_mm - start_mm) / (n - 1) as f64;
-        let radius_mm = sharpened(&self.radius_mm, BLUR * resolution_mm / step_mm);
+        let radius_mm = sharpened(&self.radius_mm, blur * resolution_mm / step_mm);
         let smooth_mm = reference(&radius_mm, step_mm)?;
         // A vessel that becomes narrower and stays so, as behind a bifurcation, has no stenosis.
         let whole_mm = recovered(&radius_mm, (BESIDE * resolution_mm / step_mm).ceil() as usize);
@@ -219,7 +225,7 @@ impl Course {
         for part in narrowing.chunk_by(|a, b| (*a > EDGE) == (*b > EDGE)) {
             let last = first + part.len() - 1;
             let worst = (first..=last).max_by(|a, b| narrowing[*a].total_cmp(&narrowing[*b])).unwrap_or(first);
-            let is_wide = 2.0 * reference_mm[worst] >= MIN_REFERENCE * resolution_mm;
+            let is_wide = 2.0 * reference_mm[worst] >= min_reference * resolution_mm;
             let length_mm = self.along_mm[last] - self.along_mm[first] + step_mm;
             let is_long = length_mm >= MIN_LENGTH * resolution_mm;
             if 100.0 * narrowing[worst] >= MIN_PERCENT && is_wide && is_long && is_inner(first) && is_inner(last) {
@@ -302,9 +308,9 @@ mod tests {
     use crate::trees::tree::Branch;
 
     const STEP_MM: f64 = 0.8;
-    const RESOLUTION_MM: f64 = 1.6;
+    const COARSE: Measurement = Measurement { resolution_mm: 1.6, radii_from: RadiiFrom::Field };
     /// Resolution at which a blur of a third of a step is taken out.
-    const SHARP_MM: f64 = 0.8;
+    const SHARP: Measurement = Measurement { resolution_mm: 0.8, radii_from: RadiiFrom::Field };
 
     /// A branch along a direction from a point, with a radius for each length along it, mm.
     fn branch(parent: Option<usize>, from: DVec3, along: DVec3, n: usize, radius: impl Fn(f64) -> f64) -> Branch {
@@ -332,7 +338,7 @@ mod tests {
     fn a_stenosis_has_its_diameters_place_and_length() {
         let taper = |mm: f64| 1.6 - 0.008 * mm;
         let vessel = branch(None, DVec3::ZERO, DVec3::X, 101, |mm| taper(mm) * narrowed(mm, 40.0, 12.0, 0.6));
-        let sharp = lesions(&tree(vec![vessel.clone()]), SHARP_MM);
+        let sharp = lesions(&tree(vec![vessel.clone()]), SHARP);
         let [lesion] = &sharp[..] else { panic!("{sharp:?}") };
         assert_eq!((lesion.branch, lesion.point), (0, 50));
         assert!((lesion.from_root_mm - 40.0).abs() < 1e-9);
@@ -341,7 +347,7 @@ mod tests {
         assert!((lesion.percent() - 60.0).abs() < 3.0, "{lesion:?}");
         // A raised cosine of 60 % exceeds a tenth over 73 % of its length.
         assert!((lesion.length_mm - 0.73 * 12.0).abs() < 2.0 * STEP_MM, "{lesion:?}");
-        let blurred = lesions(&tree(vec![vessel]), RESOLUTION_MM);
+        let blurred = lesions(&tree(vec![vessel]), COARSE);
         assert!(blurred[0].min_diameter_mm < lesion.min_diameter_mm, "{blurred:?}");
     }
 
@@ -353,13 +359,15 @@ mod tests {
         let mut beat = BeatTree {
             reference_phase: Some(0),
             threshold_per_mm: 1.0,
-            resolution_mm: SHARP_MM,
+            resolution_mm: SHARP.resolution_mm,
             spacing_mm: 0.4,
+            vessel_per_mm: None,
+            radii_from: RadiiFrom::Field,
             views: Vec::new(),
             phases: vec![with(0.6); 3],
             measured_mm: [0.6, 0.5, 0.0].map(|share| vec![with(share).branches[0].radius_mm.clone()]).into(),
         };
-        let found = lesions(&beat.phases[0], SHARP_MM);
+        let found = lesions(&beat.phases[0], SHARP);
         let percents = MeasuredBeat::new(&beat).percents(&found[0]);
         let off = percents.iter().zip([60.0, 50.0, 0.0]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         assert!(percents.len() == 3 && off < 3.0, "{percents:?}");
@@ -389,7 +397,7 @@ mod tests {
         let step = |mm: f64| 0.6 + 0.4 * (-mm / 3.0).exp();
         let main = branch(Some(0), end, DVec3::X, 60, |mm| step(mm) * wavy(mm + 47.0));
         let side = branch(Some(0), end, DVec3::Y, 60, |mm| 0.8 - 0.004 * mm);
-        let found = lesions(&tree(vec![trunk, side, main]), RESOLUTION_MM);
+        let found = lesions(&tree(vec![trunk, side, main]), COARSE);
         assert_eq!(found, [], "a healthy tree");
     }
 
@@ -400,7 +408,7 @@ mod tests {
         // The lesion begins 6 mm after the bifurcation; the branch alone would be too short to tell its reference.
         let main = branch(Some(0), end, DVec3::X, 26, |mm| 1.5 * narrowed(mm, 10.0, 9.0, 0.5));
         let side = branch(Some(0), end, DVec3::Y, 30, |_| 0.8);
-        let found = lesions(&tree(vec![trunk, side, main]), SHARP_MM);
+        let found = lesions(&tree(vec![trunk, side, main]), SHARP);
         let [lesion] = &found[..] else { panic!("{found:?}") };
         assert_eq!(lesion.branch, 2);
         assert!((lesion.from_root_mm - (29.0 * STEP_MM + 10.0)).abs() < STEP_MM, "{lesion:?}");
@@ -412,16 +420,16 @@ mod tests {
         let radius = |thin: f64, middle: f64| move |mm: f64| thin * narrowed(mm, middle, 8.0, 0.6);
         let vessel =
             |thin: f64, middle: f64| tree(vec![branch(None, DVec3::ZERO, DVec3::X, 101, radius(thin, middle))]);
-        assert_eq!(lesions(&vessel(0.9, 40.0), RESOLUTION_MM).len(), 1);
-        assert_eq!(lesions(&vessel(0.75, 40.0), RESOLUTION_MM), [], "1.5 mm at a resolution of 1.6 mm");
-        assert_eq!(lesions(&vessel(0.9, 77.0), RESOLUTION_MM), [], "at the end");
+        assert_eq!(lesions(&vessel(0.9, 40.0), COARSE).len(), 1);
+        assert_eq!(lesions(&vessel(0.75, 40.0), COARSE), [], "1.5 mm at a resolution of 1.6 mm");
+        assert_eq!(lesions(&vessel(0.9, 77.0), COARSE), [], "at the end");
     }
 
     #[test]
     fn broken_and_tiny_trees_have_no_lesions() {
-        assert_eq!(lesions(&tree(Vec::new()), RESOLUTION_MM), []);
+        assert_eq!(lesions(&tree(Vec::new()), COARSE), []);
         let nothing = branch(None, DVec3::ZERO, DVec3::X, 50, |_| f64::NAN);
         let two = branch(None, DVec3::ZERO, DVec3::X, 2, |_| 1.0);
-        assert_eq!(lesions(&tree(vec![nothing, two]), RESOLUTION_MM), []);
+        assert_eq!(lesions(&tree(vec![nothing, two]), COARSE), []);
     }
 }

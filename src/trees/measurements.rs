@@ -207,7 +207,7 @@ impl PhaseGroups<'_> {
 
     /// Returns a group for each stenosis.
     fn stenoses(&self) -> Vec<ContentItem> {
-        let found = lesions(self.tree, self.beat.resolution_mm);
+        let found = lesions(self.tree, self.beat.measurement());
         found.iter().enumerate().map(|(index, lesion)| self.stenosis(index, lesion)).collect()
     }
 
@@ -248,6 +248,7 @@ fn doubt(doubt: &Doubt) -> Vec<ContentItem> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::trees::tree::RadiiFrom;
     use glam::DVec3;
 
     fn beat(reference_phase: Option<u32>) -> BeatTree {
@@ -269,6 +270,8 @@ mod tests {
             spacing_mm: 0.5,
             views: Vec::new(),
             phases,
+            vessel_per_mm: None,
+            radii_from: RadiiFrom::Field,
             measured_mm: Vec::new(),
         }
     }

@@ -4,6 +4,7 @@ use crate::geometry::ViewRays;
 use crate::raster::percentile;
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
+use serde::Serialize;
 
 /// Share of the other fits below which a place is doubtful. With two views, 50 to 90 % of the places that nearly all fits have are true,
 /// and 10 to 50 % of those that fewer than this share have (`docs/performance.md`).
@@ -145,6 +146,25 @@ impl TreeView {
     }
 }
 
+/// Source of the radii of a tree.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RadiiFrom {
+    /// The profile of the field across the centrelines ([`crate::trees::extract`]).
+    Field,
+    /// The training images ([`crate::trees::areas`]).
+    Images,
+}
+
+/// Measurement of the radii of a tree.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Measurement {
+    /// Resolution of the field, mm.
+    pub resolution_mm: f64,
+    /// Source of the radii.
+    pub radii_from: RadiiFrom,
+}
+
 /// Vessels over the beat.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BeatTree {
@@ -157,6 +177,10 @@ pub struct BeatTree {
     pub resolution_mm: f64,
     /// Grid step at which the field was sampled, mm; the maximum over all phases.
     pub spacing_mm: f64,
+    /// Attenuation of the vessels, per mm, where it is known and the same at all phases.
+    pub vessel_per_mm: Option<f64>,
+    /// Source of the radii.
+    pub radii_from: RadiiFrom,
     /// Training views, in which the sight of stenoses is stated; empty where they are not known.
     pub views: Vec<TreeView>,
     /// Phases, in the order of the request.
@@ -164,6 +188,21 @@ pub struct BeatTree {
     /// Radii measured in the field of each phase, `[phase in the order above][branch][point]`, mm, where points are followed: such points keep
     /// the radius of the reference phase otherwise. Empty where points are not followed.
     pub measured_mm: Vec<Vec<Vec<f64>>>,
+}
+
+impl BeatTree {
+    /// Removes the phases that are not among those given.
+    pub fn keep_phases(&mut self, phases: &[u32]) {
+        let is_kept: Vec<bool> = self.phases.iter().map(|tree| phases.contains(&tree.phase)).collect();
+        let mut of_measured = is_kept.iter();
+        self.measured_mm.retain(|_| of_measured.next().is_some_and(|kept| *kept));
+        self.phases.retain(|tree| phases.contains(&tree.phase));
+    }
+
+    /// Returns the measurement of the radii of its phases.
+    pub fn measurement(&self) -> Measurement {
+        Measurement { resolution_mm: self.resolution_mm, radii_from: self.radii_from }
+    }
 }
 
 #[cfg(test)]

@@ -71,12 +71,23 @@ fn expect_foreshortening(tree: &Value, lesion: &Value) {
     assert!(most > least + 0.1, "views differ, so that the comparison means something: {shares:?}");
 }
 
-/// Compares the stenoses that C callers get with those of the tree of phase 0.
-fn expect_the_same_in_c(run: &Path, tree: &Value) {
+/// Returns the tree of phase 0 of a checkpoint alone, whose training images are not known.
+fn tree_of_the_field(directory: &Path) -> Value {
+    let (alone, out) = (directory.join("alone.safetensors"), directory.join("of-the-field.json"));
+    std::fs::copy(checkpoint::newest(&directory.join("run")).unwrap(), &alone).unwrap();
+    let said = ok(&["tree", text(&alone), "--phase", "0", "-o", text(&out)]);
+    assert!(said.contains("the radii of vessels are those of the field"), "{said}");
+    let tree = read(&out);
+    assert_eq!(tree["radii_from"], "field");
+    tree["phases"][0].clone()
+}
+
+/// Compares the stenoses that C callers get after they have loaded a checkpoint with those of the tree of phase 0.
+fn expect_the_same_in_c(newest: &Path, tree: &Value) {
     let none: *const nertca_log = null();
     let (mut context, mut made) = (null_mut(), null_mut());
     let options = CString::new("phases = 6").unwrap();
-    let newest = CString::new(text(&checkpoint::newest(run).unwrap())).unwrap();
+    let newest = CString::new(text(newest)).unwrap();
     let ok = |status| assert_eq!(status, NERTCA_OK);
     ok(unsafe { nertca_context_create(null(), none, &mut context) });
     ok(unsafe { nertca_reconstruction_create(context, options.as_ptr(), &mut made) });
@@ -151,6 +162,7 @@ fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
     let number = |value: &Value, field: &str| value[field].as_f64().unwrap();
     let off = |ours: &str, theirs: &str| (number(lesion, ours) - number(true_lesion, theirs)).abs();
     println!("{lesion}, {true_lesion}");
+    assert_eq!(read(&ill.join("tree.json"))["radii_from"], "images");
     assert!(off("min_diameter_mm", "min_diameter_mm") < 0.25, "{lesion}, {true_lesion}");
     assert!(off("stenosis_percent", "percent") < 15.0, "{lesion}, {true_lesion}");
     assert!(off("from_root_mm", "from_ostium_mm") < 3.0, "{lesion}, {true_lesion}");
@@ -159,7 +171,7 @@ fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
     assert!(page.contains("stenosis, %") && page.contains("view 3, %"), "the report has a table of stenoses");
     assert!(page.contains("class=\"strip\"") && page.contains("#d0342c"), "the report has the vessel straightened");
     expect_foreshortening(&tree, lesion);
-    expect_the_same_in_c(&ill.join("run"), &tree);
+    expect_the_same_in_c(&checkpoint::newest(&ill.join("run")).unwrap(), &tree_of_the_field(&ill));
     expect_shown_and_reported(&ill);
     expect_the_same_over_the_beat(&ill.join("all.json"), number(true_lesion, "percent"));
     let scores = lesion_scores(&ill.join("run"));

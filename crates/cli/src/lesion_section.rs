@@ -27,7 +27,7 @@ const LONG_MM: f64 = 80.0;
 
 /// Renders the stenoses of a tree of a beat.
 pub fn section(beat: &BeatTree, tree: &PhaseTree) -> Markup {
-    let vessels = straight_vessels(tree, beat.resolution_mm);
+    let vessels = straight_vessels(tree, beat.measurement());
     let lesions: Vec<&Lesion> = vessels.iter().flat_map(|vessel| &vessel.lesions).collect();
     html! {
         @if lesions.is_empty() {

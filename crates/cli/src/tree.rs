@@ -20,6 +20,7 @@ use nertca_vk::run::tree_score::score_tree;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::scan::references::{REFERENCES, References};
 use nertca_vk::score::eval::Evaluation;
+use nertca_vk::trees::areas::measure_radii;
 use nertca_vk::trees::doubt::state_doubt;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
@@ -170,10 +171,13 @@ pub fn found_in_phases(global: &GlobalOptions, gpu: &Gpu, model: &Model, phases:
     find(global, gpu, model, &AtomicBool::new(false), &options)
 }
 
-/// States in a tree what depends on the training views of its run: the views themselves and the doubt about each point.
+/// States in a tree what depends on the training views of its run: the views themselves, the radii and the doubt about each point.
 fn compare_with_views(beat: &mut BeatTree, dataset: &Dataset, run: &Path) -> Result<()> {
     let calibration = Calibration::read(run)?;
     beat.views = TreeView::of(dataset);
+    if let Err(reason) = measure_radii(beat, dataset) {
+        eprintln!("the radii of vessels are those of the field: {reason}");
+    }
     state_doubt(beat, dataset, calibration.map_or(0.0, |calibration| calibration.disagreement_px));
     Ok(())
 }
@@ -187,7 +191,10 @@ fn dataset_of(run: &Path) -> Result<Dataset> {
 /// States in a tree what depends on the training views of a run; says why where they are not known.
 pub fn compare_with_run(beat: &mut BeatTree, run: &Path) {
     if let Err(error) = dataset_of(run).and_then(|dataset| compare_with_views(beat, &dataset, run)) {
-        eprintln!("doubt and the sight of stenoses in the training views are not stated: {error}");
+        eprintln!(
+            "doubt and the sight of stenoses in the training views are not stated, and the radii of vessels are those of the field: \
+             {error}"
+        );
     }
 }
 
@@ -268,10 +275,14 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     let several = all && matches!(format, Output::Tree(TreeFormat::Vtp | TreeFormat::Swc));
     let earlier = if several { Earlier::series(&args.out, args.force)? } else { Earlier::none() };
     let gpu = global.open_device()?;
-    let options = TreeOptions { phases, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
+    // Radii are measured in the images of all phases together.
+    let follows = model.gaussians.as_ref().is_some_and(|gaussians| gaussians.deformable().is_some());
+    let sought = if follows { (0..model.shown_phases()).collect() } else { phases.clone() };
+    let options = TreeOptions { phases: sought, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
     // Ctrl-C may end the program at once, because no partial result has been written here.
     let mut beat = find(global, &gpu, &model, &AtomicBool::new(false), &options)?;
     compare_with_run(&mut beat, &args.run);
+    beat.keep_phases(&phases);
     let made = match (&sources, format) {
         (Some(sources), _) => sources.write_presentation(&beat, &args.out)?,
         (None, Output::Tree(format)) => write(&beat, &args.out, format, all)?,
@@ -304,7 +315,7 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     let measured = MeasuredBeat::new(&beat);
     let with_lesions = if beat.reference_phase.is_some() { 1 } else { beat.phases.len() };
     for tree in beat.phases.iter().take(with_lesions) {
-        for lesion in lesions(tree, beat.resolution_mm) {
+        for lesion in lesions(tree, beat.measurement()) {
             eprintln!("phase {}: {}", tree.phase, in_words(&lesion, &measured.percents(&lesion)));
         }
     }
