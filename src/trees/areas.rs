@@ -9,7 +9,7 @@ use crate::calibrate::observed::binned_to;
 use crate::evidence::background::Background;
 use crate::evidence::series::{Series, blur};
 use crate::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
-use crate::raster::{Image, median, percentile};
+use crate::raster::{Image, median, median_filter, percentile};
 use crate::scan::dataset::Dataset;
 use crate::trees::refine::tangents;
 use crate::trees::ridges::ridge_offset;
@@ -27,13 +27,16 @@ const BLUR_PX: f64 = 0.6;
 const SHADOW_ERROR: f64 = 0.1;
 /// Residual from which a pixel loses weight, in standard deviations (Huber).
 const OUTLIER: f64 = 2.5;
+/// Difference of the areas that both halves of the views show, as a share of the typical area, at which half of what images add to the field is believed.
+const DISAGREEMENT: f64 = 0.25;
 /// Rounds of weights and areas.
 const ROUNDS: usize = 3;
 /// Standard deviation of the difference of an area from that of the field, as a share of the typical area.
 const FROM_FIELD: f64 = 1.0;
-/// Additional certainty of the field for vessels of two resolution lengths, in units of that for thin ones; it grows with the fourth power of the
-/// diameter: the field shows wide vessels well, and the middle of their shadows is never uncovered.
+/// Additional certainty of the field for vessels of two resolution lengths, in units of that for thin ones, and the power of the diameter with
+/// which it grows: the field shows wide vessels well, and the middle of their shadows is never uncovered.
 const WIDE_CERTAINTY: f64 = 30.0;
+const WIDE_POWER: i32 = 12;
 /// Standard deviation of the difference of two successive radii, as a share of the typical radius.
 const STEP_CHANGE: f64 = 0.25;
 /// Minimum radius, as a share of the typical one, for which differences of radii are expressed by those of areas.
@@ -52,6 +55,10 @@ const FARTHEST_RIDGE_PX: f64 = 1.6;
 /// Number of points on each side over which distances from ridges are averaged, and how many of them must have a ridge.
 const RIDGE_POINTS: usize = 4;
 const MIN_RIDGES: usize = 4;
+/// Share of the changes of a pixel from phase to phase that is an error of the shadows there.
+const OF_CHANGES: f64 = 0.4;
+/// Radius of the median filter of the changes from phase to phase, pixels.
+const STEADY_PX: usize = 2;
 /// Minimum number of phases that a view must show: its static background is found from their differences.
 const MIN_PHASES: usize = 3;
 /// Minimum radius, in units of the field's resolution.
@@ -85,8 +92,9 @@ pub fn measure_radii(beat: &mut BeatTree, dataset: &Dataset) -> Result<(), &'sta
     let mut areas = field.clone();
     for _ in 0..ROUNDS {
         views.iter_mut().for_each(|view| view.weigh(&areas));
-        areas = solved(&views, &expected, &areas);
+        areas = solved(&views.iter().collect::<Vec<_>>(), &expected, &areas);
     }
+    let areas = believed(&views, &expected, areas);
     let least_mm = MIN_RADIUS * beat.resolution_mm;
     let radii: Vec<f64> = areas.iter().map(|area| (area.max(0.0) / PI).sqrt().max(least_mm)).collect();
     for tree in &mut beat.phases {
@@ -112,7 +120,7 @@ struct ShadowedFrame {
 /// The images of a view.
 struct ShadowedView {
     frames: Vec<ShadowedFrame>,
-    /// Variance of the noise of each pixel of the blurred images.
+    /// Variance of each pixel of the blurred images: of its noise, and of a share of its changes from phase to phase.
     variance: Vec<f64>,
     /// Whether each pixel shows the patient.
     shown: Vec<bool>,
@@ -140,8 +148,12 @@ impl ShadowedView {
         if frames.len() < MIN_PHASES {
             return None;
         }
-        let blurred = 4.0 * PI * BLUR_PX.powi(2);
-        let variance = background.noise.values.iter().map(|noise| f64::from(*noise).powi(2) / blurred).collect();
+        let noise =
+            background.noise.values.iter().map(|noise| f64::from(*noise).powi(2) / (4.0 * PI * BLUR_PX.powi(2)));
+        let variance = noise
+            .zip(unsteadiness(&frames, size))
+            .map(|(noise, changes)| noise + (OF_CHANGES * changes).powi(2))
+            .collect();
         let on_canvas = |p: usize| p / size[0] * dataset.width + p % size[0];
         let shown = (0..size[0] * size[1]).map(|p| dataset.shows(view, on_canvas(p))).collect();
         Some(ShadowedView { frames, variance, shown })
@@ -203,6 +215,19 @@ impl ShadowedView {
     fn images(&self, areas: &[f64]) -> Vec<Vec<f64>> {
         self.frames.par_iter().map(|frame| frame.shadows.image(areas, self.n_pixels())).collect()
     }
+}
+
+/// Returns the standard deviation of each pixel from phase to phase. Where shadows pass, it includes errors of their places.
+fn unsteadiness(frames: &[ShadowedFrame], [width, height]: [usize; 2]) -> impl Iterator<Item = f64> {
+    // Ratio of a normal distribution's standard deviation to its median absolute value, for differences of two values.
+    const MEDIAN_TO_DEVIATION: f32 = 1.4826 / std::f32::consts::SQRT_2;
+    let at = |p: usize| {
+        let mut steps: Vec<f32> =
+            frames.windows(2).map(|pair| (pair[1].image[p] - pair[0].image[p]).abs() as f32).collect();
+        MEDIAN_TO_DEVIATION * median(&mut steps)
+    };
+    let values = (0..width * height).into_par_iter().map(at).collect();
+    median_filter(&Image { width, height, values }, STEADY_PX).values.into_iter().map(f64::from)
 }
 
 /// What is known about an image before the areas are.
@@ -310,7 +335,7 @@ impl Expected<'_> {
                 let end = i.min(n - 1 - i) as f64;
                 let at_end = END_CERTAINTY * (-0.5 * (end / END_POINTS).powi(2)).exp();
                 let half_widths = (area / PI).sqrt() / resolution_mm;
-                let wide = WIDE_CERTAINTY * half_widths.powi(4);
+                let wide = WIDE_CERTAINTY * half_widths.powi(WIDE_POWER);
                 expected.certainty.push((FROM_FIELD.powi(-2) + at_end + wide) / area.powi(2));
                 expected.typical.push(area);
                 expected.goes_on.push(i + 1 < *n);
@@ -360,7 +385,7 @@ fn typical(areas: &[f64]) -> Vec<f64> {
 }
 
 /// Returns the areas that explain the images best, by conjugate gradients from given areas.
-fn solved(views: &[ShadowedView], expected: &Expected<'_>, start: &[f64]) -> Vec<f64> {
+fn solved(views: &[&ShadowedView], expected: &Expected<'_>, start: &[f64]) -> Vec<f64> {
     let smoothness = expected.smoothness(start);
     let applied = |areas: &[f64]| {
         let mut out = expected.applied(&smoothness, areas);
@@ -374,6 +399,21 @@ fn solved(views: &[ShadowedView], expected: &Expected<'_>, start: &[f64]) -> Vec
         view.add_sums(&images, &mut right);
     }
     conjugate_gradients(applied, &right, start)
+}
+
+/// Returns the areas where both halves of the views agree on them, and those of the field where they do not: where vessels lie over each other in
+/// some views, shadows there may be shared wrongly.
+fn believed(views: &[ShadowedView], expected: &Expected<'_>, areas: Vec<f64>) -> Vec<f64> {
+    let half = |first: usize| {
+        let own: Vec<&ShadowedView> = views.iter().skip(first).step_by(2).collect();
+        solved(&own, expected, &areas)
+    };
+    let (even, odd) = (half(0), half(1));
+    let share = |i: usize| {
+        let apart = (even[i] - odd[i]) / (DISAGREEMENT * expected.typical[i]);
+        1.0 / (1.0 + apart * apart)
+    };
+    (0..areas.len()).map(|i| expected.field[i] + share(i) * (areas[i] - expected.field[i])).collect()
 }
 
 /// Solves a symmetric positive definite system that is given by its product with a vector.

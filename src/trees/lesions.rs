@@ -30,7 +30,7 @@ const MIN_AREA: f64 = 0.5;
 /// Minimum reference diameter, in units of the field's resolution, where radii are those of the field and where they are those of the images:
 /// whether a thinner vessel is narrowed cannot be told.
 const MIN_REFERENCE: f64 = 1.0;
-const MIN_REFERENCE_IN_IMAGES: f64 = 0.5;
+const MIN_REFERENCE_IN_IMAGES: f64 = 0.6;
 
 /// A place where a vessel is narrowed.
 #[derive(Debug, Clone, PartialEq)]

@@ -182,10 +182,9 @@ fn scores_in_3d_are_those_of_eval() {
         close_to(name, value, "tree", key);
     }
     // `eval` measures radii in the images. A session does so once it has trained, because a checkpoint does not have the corrections of views.
-    for (name, value, key) in [
-        ("radius", found.radius_error_mm, "radius_error_mm"),
-        ("radius RMSE", found.radius_rmse_mm, "radius_rmse_mm"),
-    ] {
+    for (name, value, key) in
+        [("radius", found.radius_error_mm, "radius_error_mm"), ("radius RMSE", found.radius_rmse_mm, "radius_rmse_mm")]
+    {
         let of_images = told["tree"]["mean"][key].as_f64().unwrap();
         println!("{name}: {value} of the field, {of_images} of the images");
         assert!(value != of_images && (value - of_images).abs() < 0.3, "{name}: {value}, {of_images}");

@@ -192,14 +192,17 @@ fn what_has_no_tree_is_refused() {
 #[test]
 fn c_callers_get_the_same_tree() {
     let (directory, Trained { run, .. }) = (tempfile::tempdir().unwrap(), trained());
-    let written = tree_of(run, &directory.path().join("all.json"), &[]);
+    // A checkpoint alone, whose training images are not known, as for the caller.
+    let newest = checkpoint::newest(run).unwrap();
+    let alone = directory.path().join("alone.safetensors");
+    std::fs::copy(&newest, &alone).unwrap();
+    let written = tree_of(&alone, &directory.path().join("all.json"), &[]);
     let none: *const nertca_log = null();
     let (mut context, mut reconstruction) = (null_mut(), null_mut());
     assert_eq!(unsafe { nertca_context_create(null(), none, &mut context) }, NERTCA_OK);
     let options = CString::new(format!("phases = {PHASES}")).unwrap();
     let made = unsafe { nertca_reconstruction_create(context, options.as_ptr(), &mut reconstruction) };
     assert_eq!(made, NERTCA_OK);
-    let newest = checkpoint::newest(run).unwrap();
     let path = CString::new(text(&newest)).unwrap();
     assert_eq!(unsafe { nertca_reconstruction_load(reconstruction, path.as_ptr()) }, NERTCA_OK);
 

@@ -2,7 +2,7 @@
 
 use super::lettering;
 use super::options::GlobalOptions;
-use super::tree::{found_in_phases, training_views};
+use super::tree::{found_in_phases, measure_in_run};
 use clap::Args;
 use image::{DynamicImage, Rgb, RgbImage};
 use nertca_vk::checkpoint::newest_model;
@@ -87,7 +87,7 @@ impl Plan {
         let is_followed = beat.reference_phase.is_some();
         let decisive = decisive_phases(beat.phases.len() as u32);
         let counts = |(index, tree): (usize, &PhaseTree)| {
-            // The command finds the decisive phases alone.
+            // Where points are not followed, the command finds the decisive phases alone.
             let counts = index == 0 || is_followed && (beat.phases.len() <= 2 || decisive.contains(&tree.phase));
             counts.then(|| tree.clone())
         };
@@ -110,7 +110,7 @@ pub fn run(global: &GlobalOptions, args: &NextArgs) -> Result<()> {
     let model = newest_model(&args.run)?;
     let gpu = global.open_device()?;
     let mut beat = found_in_phases(global, &gpu, &model, decisive_phases(model.shown_phases()))?;
-    beat.views = training_views(&args.run, "the training views do not count");
+    measure_in_run(&mut beat, &args.run, "the training views do not count");
     let plan = Plan::new(&beat, (&model.c_arm, model.image_size), args.branch, &limits, args.count)?;
     if let Some(file) = &args.out {
         write_map(&plan, &beat.views, file)?;

@@ -164,8 +164,16 @@ fn in_words(lesion: &Lesion, over_beat: &[f64]) -> String {
     )
 }
 
-/// Finds the vessels of a model at phases.
+/// Returns the phases in which vessels must be found for the trees of some phases: all, where points are followed, because their radii are
+/// measured in the images of all phases together.
+fn phases_to_find(model: &Model, phases: &[u32]) -> Vec<u32> {
+    let follows = model.gaussians.as_ref().is_some_and(|gaussians| gaussians.deformable().is_some());
+    if follows { (0..model.shown_phases()).collect() } else { phases.to_vec() }
+}
+
+/// Finds the vessels of a model at phases, or at all of them where points are followed.
 pub fn found_in_phases(global: &GlobalOptions, gpu: &Gpu, model: &Model, phases: Vec<u32>) -> Result<BeatTree> {
+    let phases = phases_to_find(model, &phases);
     let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };
     // Ctrl-C may end the program at once, because nothing has been written.
     find(global, gpu, model, &AtomicBool::new(false), &options)
@@ -174,12 +182,17 @@ pub fn found_in_phases(global: &GlobalOptions, gpu: &Gpu, model: &Model, phases:
 /// States in a tree what depends on the training views of its run: the views themselves, the radii and the doubt about each point.
 fn compare_with_views(beat: &mut BeatTree, dataset: &Dataset, run: &Path) -> Result<()> {
     let calibration = Calibration::read(run)?;
+    measure_in_views(beat, dataset);
+    state_doubt(beat, dataset, calibration.map_or(0.0, |calibration| calibration.disagreement_px));
+    Ok(())
+}
+
+/// States the training views of a dataset in a tree, and measures its radii in their images; says why where it cannot.
+fn measure_in_views(beat: &mut BeatTree, dataset: &Dataset) {
     beat.views = TreeView::of(dataset);
     if let Err(reason) = measure_radii(beat, dataset) {
         eprintln!("the radii of vessels are those of the field: {reason}");
     }
-    state_doubt(beat, dataset, calibration.map_or(0.0, |calibration| calibration.disagreement_px));
-    Ok(())
 }
 
 /// Returns the dataset of a run as it was calibrated.
@@ -198,12 +211,13 @@ pub fn compare_with_run(beat: &mut BeatTree, run: &Path) {
     }
 }
 
-/// Returns the training views of a run as it was calibrated; where they are not known, `lacking` says what that means.
-pub fn training_views(run: &Path, lacking: &str) -> Vec<TreeView> {
-    dataset_of(run).map(|dataset| TreeView::of(&dataset)).unwrap_or_else(|error| {
-        eprintln!("{lacking}: {error}");
-        Vec::new()
-    })
+/// States the training views of a run in a tree, and measures its radii in their images; where they are not known, `lacking` says what that
+/// means.
+pub fn measure_in_run(beat: &mut BeatTree, run: &Path, lacking: &str) {
+    match dataset_of(run) {
+        Ok(dataset) => measure_in_views(beat, &dataset),
+        Err(error) => eprintln!("{lacking}: {error}"),
+    }
 }
 
 /// Kind of file to which a tree is written.
@@ -275,9 +289,7 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     let several = all && matches!(format, Output::Tree(TreeFormat::Vtp | TreeFormat::Swc));
     let earlier = if several { Earlier::series(&args.out, args.force)? } else { Earlier::none() };
     let gpu = global.open_device()?;
-    // Radii are measured in the images of all phases together.
-    let follows = model.gaussians.as_ref().is_some_and(|gaussians| gaussians.deformable().is_some());
-    let sought = if follows { (0..model.shown_phases()).collect() } else { phases.clone() };
+    let sought = phases_to_find(&model, &phases);
     let options = TreeOptions { phases: sought, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
     // Ctrl-C may end the program at once, because no partial result has been written here.
     let mut beat = find(global, &gpu, &model, &AtomicBool::new(false), &options)?;
