@@ -742,7 +742,8 @@ typedef struct {
    */
   double *points_mm;
   /**
-   * Radius of the vessel at each point, mm.
+   * Radius of the vessel at each point, mm: as the frames show it where they are known and the options state the attenuation of vessels, else as
+   * the field does.
    */
   double *radius_mm;
   /**

@@ -525,7 +525,7 @@ mod tests {
     fn tree() -> BeatTree {
         let branch = |phase: u32| {
             let [left, posterior] = axis_mm(phase);
-            let off_mm = 0.7 * if phase % 2 == 0 { 1.0 } else { -1.0 };
+            let off_mm = 0.7 * if phase.is_multiple_of(2) { 1.0 } else { -1.0 };
             Branch {
                 parent: None,
                 points_mm: (0..60)
