@@ -462,7 +462,7 @@ mod tests {
     }
 
     fn contrast(phase: u32) -> f64 {
-        if phase == 3 { 0.7 } else { 1.0 }
+        if phase == 1 || phase == 3 { 0.4 } else { 1.0 }
     }
 
     /// Images from the front and from the side of a vessel along the head's direction over a sloping background: exact chords, 8 x 8 of them
@@ -521,11 +521,11 @@ mod tests {
         }
     }
 
-    /// A tree as a blurred field shows the vessel: too wide, without the stenosis, and with centrelines off by a share of a pixel.
+    /// A tree as a blurred field shows the vessel: too wide, without the stenosis, and with centrelines off by most of a pixel.
     fn tree() -> BeatTree {
         let branch = |phase: u32| {
             let [left, posterior] = axis_mm(phase);
-            let off_mm = 0.7 * if phase.is_multiple_of(2) { 1.0 } else { -1.0 };
+            let off_mm = 1.4 * if phase.is_multiple_of(2) { 1.0 } else { -1.0 };
             Branch {
                 parent: None,
                 points_mm: (0..60)
@@ -557,7 +557,7 @@ mod tests {
         let branch = &beat.phases[2].branches[0];
         let off = |i: usize| (branch.radius_mm[i] - radius_mm(branch.points_mm[i].z)).abs();
         let worst = (8..52).max_by(|a, b| off(*a).total_cmp(&off(*b))).unwrap();
-        assert!(off(worst) < 0.08, "{} mm at {}: {:?}", off(worst), branch.points_mm[worst].z, branch.radius_mm);
+        assert!(off(worst) < 0.06, "{} mm at {}: {:?}", off(worst), branch.points_mm[worst].z, branch.radius_mm);
         assert!(
             beat.phases.iter().all(|tree| tree.branches[0].radius_mm == branch.radius_mm),
             "points keep their radii"
