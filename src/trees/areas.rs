@@ -230,7 +230,7 @@ fn unsteadiness(frames: &[ShadowedFrame], [width, height]: [usize; 2]) -> impl I
     median_filter(&Image { width, height, values }, STEADY_PX).values.into_iter().map(f64::from)
 }
 
-/// What is known about an image before the areas are.
+/// An image of a view and how the tree is projected into it.
 struct Projection<'a> {
     /// Rays that see the heart.
     rays: ViewRays,
