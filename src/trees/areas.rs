@@ -27,7 +27,8 @@ const BLUR_PX: f64 = 0.6;
 const SHADOW_ERROR: f64 = 0.1;
 /// Residual from which a pixel loses weight, in standard deviations (Huber).
 const OUTLIER: f64 = 2.5;
-/// Difference of the areas that both halves of the views show, as a share of the typical area, at which half of what images add to the field is believed.
+/// Difference of the areas that both halves of the views show, as a share of the typical area, at which half of what images add to the field
+/// is believed.
 const DISAGREEMENT: f64 = 0.25;
 /// Rounds of weights and areas.
 const ROUNDS: usize = 3;
@@ -59,6 +60,8 @@ const MIN_RIDGES: usize = 4;
 const OF_CHANGES: f64 = 0.4;
 /// Radius of the median filter of the changes from phase to phase, pixels.
 const STEADY_PX: usize = 2;
+/// Minimum number of views: radii of one alone could not be compared.
+const MIN_VIEWS: usize = 2;
 /// Minimum number of phases that a view must show: its static background is found from their differences.
 const MIN_PHASES: usize = 3;
 /// Minimum radius, in units of the field's resolution.
@@ -85,8 +88,8 @@ pub fn measure_radii(beat: &mut BeatTree, dataset: &Dataset) -> Result<(), &'sta
     let dataset = &binned_to(dataset, SIDE);
     let of_view = |series: Series| ShadowedView::new(series, dataset, &beat.phases, attenuation);
     let mut views: Vec<ShadowedView> = Series::each(dataset).filter_map(of_view).collect();
-    if views.is_empty() {
-        return Err("no training view shows three phases of the tree");
+    if views.len() < MIN_VIEWS {
+        return Err("fewer than two training views show three phases of the tree");
     }
     let expected = Expected::new(&field, &lengths, beat.resolution_mm);
     let mut areas = field.clone();
@@ -578,6 +581,9 @@ mod tests {
         short.keep_phases(&[0, 4]);
         assert_eq!(short.phases.iter().map(|tree| tree.phase).collect::<Vec<_>>(), [0, 4]);
         refused(&mut short, &dataset, "three phases");
+        let mut one_view = dataset.clone();
+        one_view.frames.retain(|frame| frame.view == 0);
+        refused(&mut tree(), &one_view, "two training views");
     }
 
     #[test]

@@ -185,8 +185,8 @@ pub struct BeatTree {
     pub views: Vec<TreeView>,
     /// Phases, in the order of the request.
     pub phases: Vec<PhaseTree>,
-    /// Radii measured in the field of each phase, `[phase in the order above][branch][point]`, mm, where points are followed: such points keep
-    /// the radius of the reference phase otherwise. Empty where points are not followed.
+    /// Radii measured in the field of each phase, `[phase in the order above][branch][point]`, mm, where points are followed: such points have
+    /// one radius for all phases otherwise. Empty where points are not followed.
     pub measured_mm: Vec<Vec<Vec<f64>>>,
 }
 
