@@ -30,7 +30,7 @@ pub fn vessels(rows: &[Gaussian], setup: &GaussianSetup, link: f64) -> Vec<bool>
 }
 
 /// Returns the middle one of a Gaussian's three scales, pixels; the maximum may lie along a vessel.
-fn breadth(g: &Gaussian, setup: &GaussianSetup) -> f32 {
+pub fn breadth(g: &Gaussian, setup: &GaussianSetup) -> f32 {
     let scales = scales(g, setup);
     (scales.element_sum() - scales.max_element() - scales.min_element()) as f32
 }

@@ -18,7 +18,7 @@ use crate::methods::dynamic_gaussians::catheter::Catheter;
 use crate::methods::dynamic_gaussians::filling::{Filling, FillingBuffers, from_set_of_phase};
 use crate::methods::dynamic_gaussians::members::{MemberBuffers, Members};
 use crate::methods::dynamic_gaussians::per_phase::{MAX_PASSES, check_count, strong};
-use crate::methods::dynamic_gaussians::pruning::{Judge, short_components};
+use crate::methods::dynamic_gaussians::pruning::{Judge, broad_components, short_components};
 use crate::methods::dynamic_gaussians::stages::{
     DeformableKernels, DeformablePass, GridBuffers, OwnMotion, OwnMotionBuffers, Track,
 };
@@ -57,6 +57,8 @@ pub struct DeformableTrainer {
     prunes: bool,
     /// Catheter that was found at the end.
     catheter: Option<Catheter>,
+    /// Number of Gaussians broader than vessels that were dropped at the end.
+    n_broad: usize,
 }
 
 /// Setup, schedule and buffers of iterations of one kind: the joint fit of everything, or the tracking of a phase.
@@ -160,6 +162,7 @@ impl DeformableTrainer {
             step: 0,
             prunes: true,
             catheter: None,
+            n_broad: 0,
         })
     }
 
@@ -354,8 +357,8 @@ impl DeformableTrainer {
         self.step += self.iterations.run(&self.gpu, first, stop)?;
         if setup::parts_from_strays(&self.config.gaussians, self.step) {
             self.drop_strays()?;
+            self.drop_unsupported()?;
             if self.prunes {
-                self.drop_unsupported()?;
                 self.find_catheter()?;
             }
         }
@@ -413,8 +416,20 @@ impl DeformableTrainer {
         Ok(())
     }
 
+    /// Returns sentences on a catheter that was found and on what was dropped, once.
+    pub(super) fn take_findings(&mut self) -> Vec<String> {
+        let n = std::mem::take(&mut self.n_broad);
+        let broad = (n > 0).then(|| {
+            format!(
+                "{n} Gaussians are broader than the vessels and hidden from some view, e.g. by a blade: what they show is no vessel \
+                 and is left out"
+            )
+        });
+        broad.into_iter().chain(self.take_catheter()).collect()
+    }
+
     /// Returns a sentence on the catheter that was found, once.
-    pub(super) fn take_catheter(&mut self) -> Option<String> {
+    fn take_catheter(&mut self) -> Option<String> {
         let Catheter { extent_mm, slowest, .. } = self.catheter.take()?;
         let found = format!(
             "a catheter seems to be in the dynamic field: {extent_mm:.0} mm whose motion falls to {:.0} % of that of the vessels",
@@ -426,24 +441,30 @@ impl DeformableTrainer {
         })
     }
 
-    /// Drops short components that the images do not support.
+    /// Drops components that are no vessels: broad ones that not all views show, and, where the trainer prunes, short ones that the
+    /// images do not support.
     fn drop_unsupported(&mut self) -> Result<()> {
-        let n = self.n as usize;
         let members = self.download()?;
-        let components = short_components(&members.particles.rows, &self.joint.setup, self.targets.lengths.factor);
-        if components.is_empty() {
+        let (rows, setup) = (&members.particles.rows, &self.joint.setup);
+        let broad = broad_components(rows, setup);
+        let short = if self.prunes { short_components(rows, setup, self.targets.lengths.factor) } else { Vec::new() };
+        if broad.is_empty() && short.is_empty() {
             return Ok(());
         }
         let judge = Judge::new(&self.targets, &self.images()?);
-        let mut keep = vec![true; n];
-        for component in components {
-            let mut member = vec![false; n];
+        let mut keep = vec![true; rows.len()];
+        let n_broad = broad.len();
+        for (k, component) in broad.into_iter().chain(short).enumerate() {
+            let mut member = vec![false; rows.len()];
             component.iter().for_each(|i| member[*i] = true);
             let mut alone = members.clone();
             alone.retain(&member);
             let alone = alone.upload(&self.gpu, &self.joint.setup)?;
-            if !judge.supports(&self.images_of(&alone, component.len() as u32)?) {
+            let images = self.images_of(&alone, component.len() as u32)?;
+            let is_vessel = if k < n_broad { judge.is_shown_by_all(&images) } else { judge.supports(&images) };
+            if !is_vessel {
                 component.iter().for_each(|i| keep[*i] = false);
+                self.n_broad += if k < n_broad { component.len() } else { 0 };
             }
         }
         // A set without Gaussians is no set: where the images support none, all stay.
