@@ -38,7 +38,7 @@ pub(super) fn short_components(rows: &[Gaussian], setup: &GaussianSetup, factor:
 }
 
 /// Returns what is broader than vessels, as lists of indices of Gaussians: components whose median breadth exceeds that of the widest
-/// vessel, and single Gaussians of other components. The largest component is the tree of the vessels.
+/// vessel, and single Gaussians of all other components. The largest component is the tree of the vessels.
 pub(super) fn broad_components(rows: &[Gaussian], setup: &GaussianSetup) -> Vec<Vec<usize>> {
     let breadths: Vec<f32> = rows.iter().map(|g| breadth(g, setup)).collect();
     let breadth_at = |component: &[usize], share: f64| {
@@ -86,7 +86,8 @@ impl Judge<'_> {
         self.votes(of_component).into_iter().fold(f64::INFINITY, f64::min) > LEAST_GAIN
     }
 
-    /// Tells whether all views show a component, which images `of_component` are of: none has a blade or an edge before it.
+    /// Tells whether all views whose background is known show a component, which images `of_component` are of: none has a blade or an edge
+    /// before it.
     pub(super) fn is_shown_by_all(&self, of_component: &[f32]) -> bool {
         let traces = self.traces(of_component);
         let strongest = strongest(&traces);
@@ -100,15 +101,17 @@ impl Judge<'_> {
         traces.iter().filter(|trace| trace.votes(strongest)).map(|trace| trace.gain).collect()
     }
 
+    /// Returns the traces in the views whose background is known.
     fn traces(&self, of_component: &[f32]) -> Vec<Trace> {
-        (0..self.targets.n_views).map(|view| self.trace(of_component, view)).collect()
+        (0..self.targets.n_views).filter_map(|view| self.trace(of_component, view)).collect()
     }
 
-    fn trace(&self, of_component: &[f32], view: usize) -> Trace {
+    fn trace(&self, of_component: &[f32], view: usize) -> Option<Trace> {
         let targets = self.targets;
-        let mut trace = Trace::default();
+        let mut found = None;
         for image in targets.image_of.iter().skip(view).step_by(targets.n_views).flatten() {
             let Some(left) = &self.left[*image] else { continue };
+            let trace = found.get_or_insert_with(Trace::default);
             let begin = image * targets.n_pixels();
             for (pixel, left) in left.iter().enumerate() {
                 let at = begin + pixel;
@@ -125,7 +128,7 @@ impl Judge<'_> {
                 trace.shown += e * e;
             }
         }
-        trace
+        found
     }
 }
 
@@ -212,6 +215,10 @@ mod tests {
         assert!(!shown(&behind(&|column, _| column <= 20)), "a blade before more than half of it");
         assert!(!shown(&behind(&|_, phase| phase < PHASES / 2)), "hidden at half the phases");
         assert!(shown(&behind(&|column, _| column < 20)), "a blade before the smaller part of it");
+        let targets = seen([1.0; VIEWS]);
+        let mut judge = Judge::new(&targets, &field);
+        (0..PHASES).for_each(|phase| judge.left[phase * VIEWS + 1] = None);
+        assert!(judge.is_shown_by_all(&field), "a view without a known background hides nothing");
     }
 
     #[test]
