@@ -421,8 +421,7 @@ impl DeformableTrainer {
         let n = std::mem::take(&mut self.n_broad);
         let broad = (n > 0).then(|| {
             format!(
-                "{n} Gaussians are broader than the vessels and hidden from some view, e.g. by a blade: what they show is no vessel \
-                 and is left out"
+                "Gaussians that are left out, because they are broader than the vessels and hidden from some view, e.g. by a blade: {n}"
             )
         });
         broad.into_iter().chain(self.take_catheter()).collect()
