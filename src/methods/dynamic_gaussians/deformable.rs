@@ -18,7 +18,7 @@ use crate::methods::dynamic_gaussians::catheter::Catheter;
 use crate::methods::dynamic_gaussians::filling::{Filling, FillingBuffers, from_set_of_phase};
 use crate::methods::dynamic_gaussians::members::{MemberBuffers, Members};
 use crate::methods::dynamic_gaussians::per_phase::{MAX_PASSES, check_count, strong};
-use crate::methods::dynamic_gaussians::pruning::{Judge, broad_components, short_components};
+use crate::methods::dynamic_gaussians::pruning::{Judge, broad_parts, components, short};
 use crate::methods::dynamic_gaussians::stages::{
     DeformableKernels, DeformablePass, GridBuffers, OwnMotion, OwnMotionBuffers, Track,
 };
@@ -445,32 +445,41 @@ impl DeformableTrainer {
     fn drop_unsupported(&mut self) -> Result<()> {
         let members = self.download()?;
         let (rows, setup) = (&members.particles.rows, &self.joint.setup);
-        let broad = broad_components(rows, setup);
-        let short = if self.prunes { short_components(rows, setup, self.targets.lengths.factor) } else { Vec::new() };
+        let components = components(rows, setup);
+        let broad = broad_parts(&components, rows, setup);
+        let short = if self.prunes { short(&components, rows, self.targets.lengths.factor) } else { Vec::new() };
         if broad.is_empty() && short.is_empty() {
             return Ok(());
         }
         let judge = Judge::new(&self.targets, &self.images()?);
         let mut keep = vec![true; rows.len()];
-        let n_broad = broad.len();
-        for (k, component) in broad.into_iter().chain(short).enumerate() {
-            let mut member = vec![false; rows.len()];
-            component.iter().for_each(|i| member[*i] = true);
-            let mut alone = members.clone();
-            alone.retain(&member);
-            let alone = alone.upload(&self.gpu, &self.joint.setup)?;
-            let images = self.images_of(&alone, component.len() as u32)?;
-            let is_vessel = if k < n_broad { judge.is_shown_by_all(&images) } else { judge.supports(&images) };
-            if !is_vessel {
+        for part in &broad {
+            if !judge.is_shown_by_all(&self.images_of_part(&members, part)?) {
+                part.iter().for_each(|i| keep[*i] = false);
+            }
+        }
+        let n_broad = keep.iter().filter(|keep| !**keep).count();
+        let left: Vec<&Vec<usize>> = short.into_iter().filter(|component| keep[component[0]]).collect();
+        for component in left {
+            if !judge.supports(&self.images_of_part(&members, component)?) {
                 component.iter().for_each(|i| keep[*i] = false);
-                self.n_broad += if k < n_broad { component.len() } else { 0 };
             }
         }
         // A set without Gaussians is no set: where the images support none, all stay.
         if keep.contains(&true) && keep.contains(&false) {
             self.retain(|_| keep)?;
+            self.n_broad = n_broad;
         }
         Ok(())
+    }
+
+    /// Images of some of the Gaussians, `[image][pixel]`, shares of the strongest change.
+    fn images_of_part(&self, members: &Members, part: &[usize]) -> Result<Vec<f32>> {
+        let mut keep = vec![false; members.particles.rows.len()];
+        part.iter().for_each(|i| keep[*i] = true);
+        let mut alone = members.clone();
+        alone.retain(&keep);
+        self.images_of(&alone.upload(&self.gpu, &self.joint.setup)?, part.len() as u32)
     }
 
     /// Keeps some of the Gaussians on the device, and returns them.

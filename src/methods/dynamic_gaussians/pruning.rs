@@ -31,35 +31,34 @@ const HIDDEN: f64 = 0.3;
 /// Deviation of a good fit without noise, as a share of the strongest change.
 const FIT_DEVIATION: f64 = 0.02;
 
-/// Returns the short components of a set, as indices of its Gaussians.
-pub(super) fn short_components(rows: &[Gaussian], setup: &GaussianSetup, factor: f64) -> Vec<Vec<usize>> {
-    let short = |members: &Vec<usize>| extent(members.iter().map(|i| position(&rows[*i]))) <= SHORT * factor;
-    components(rows, setup).into_iter().filter(short).collect()
+/// Returns the short ones of a set's components.
+pub(super) fn short<'a>(components: &'a [Vec<usize>], rows: &[Gaussian], factor: f64) -> Vec<&'a Vec<usize>> {
+    let is_short = |members: &&Vec<usize>| extent(members.iter().map(|i| position(&rows[*i]))) <= SHORT * factor;
+    components.iter().filter(is_short).collect()
 }
 
-/// Returns what is broader than vessels, as lists of indices of Gaussians: components whose median breadth exceeds that of the widest
-/// vessel, and single Gaussians of all other components. The largest component is the tree of the vessels.
-pub(super) fn broad_components(rows: &[Gaussian], setup: &GaussianSetup) -> Vec<Vec<usize>> {
+/// Returns what is broader than vessels in a set's components, as lists of indices of Gaussians: components whose median breadth exceeds
+/// that of the widest vessel, and single Gaussians of all other components. The largest component is the tree of the vessels.
+pub(super) fn broad_parts(components: &[Vec<usize>], rows: &[Gaussian], setup: &GaussianSetup) -> Vec<Vec<usize>> {
     let breadths: Vec<f32> = rows.iter().map(|g| breadth(g, setup)).collect();
     let breadth_at = |component: &[usize], share: f64| {
         percentile(&component.iter().map(|i| breadths[*i]).collect::<Vec<_>>(), share)
     };
-    let components = components(rows, setup);
     let Some(tree) = components.iter().max_by_key(|component| component.len()) else { return Vec::new() };
     let widest = breadth_at(tree, WIDEST_PERCENTILE);
-    let is_broad = |component: &Vec<usize>| breadth_at(component, 0.5) > BROADER_COMPONENT * widest;
-    let (mut broad, others): (Vec<_>, Vec<_>) = components.into_iter().partition(is_broad);
-    let single = others.into_iter().flatten().filter(|i| breadths[*i] > BROADER_GAUSSIAN * widest);
-    broad.extend(single.map(|i| vec![i]));
-    broad
+    let is_broad = |component: &&Vec<usize>| breadth_at(component, 0.5) > BROADER_COMPONENT * widest;
+    let (broad, others): (Vec<_>, Vec<_>) = components.iter().partition(is_broad);
+    let single = others.into_iter().flatten().filter(|i| breadths[**i] > BROADER_GAUSSIAN * widest);
+    broad.into_iter().cloned().chain(single.map(|i| vec![*i])).collect()
 }
 
 fn position(g: &Gaussian) -> DVec3 {
     DVec3::from_array(g.position.map(f64::from))
 }
 
-/// Returns groups of Gaussians whose distances are below [`LINK_SCALES`] times their mean longest scale, directly or through others.
-fn components(rows: &[Gaussian], setup: &GaussianSetup) -> Vec<Vec<usize>> {
+/// Returns the components of a set, as indices of its Gaussians: those whose distances are below [`LINK_SCALES`] times their mean longest
+/// scale, directly or through others.
+pub(super) fn components(rows: &[Gaussian], setup: &GaussianSetup) -> Vec<Vec<usize>> {
     let longest: Vec<f64> = rows.iter().map(|g| scales(g, setup).max_element()).collect();
     let near = |i: usize, j: usize| {
         position(&rows[i]).distance(position(&rows[j])) < LINK_SCALES * 0.5 * (longest[i] + longest[j])
@@ -231,7 +230,7 @@ mod tests {
         };
         let thin = |x: f32, y: f32| of(x, y, [2.0, 0.5, 0.5]);
         let broad = |rows: &[Gaussian]| {
-            let mut broad = broad_components(rows, &setup);
+            let mut broad = broad_parts(&components(rows, &setup), rows, &setup);
             broad.iter_mut().for_each(|component| component.sort_unstable());
             broad.sort_unstable();
             broad
@@ -258,10 +257,10 @@ mod tests {
         // Scales of 1: Gaussians are linked below a distance of 2.5.
         let mut rows: Vec<Gaussian> = (0..10).map(|i| at(2.0 * i as f32, 0.0)).collect();
         rows.extend([at(0.0, 9.0), at(2.0, 9.0), at(7.0, 9.0)]);
-        let mut short = short_components(&rows, &setup, 1.0);
-        short.iter_mut().for_each(|component| component.sort_unstable());
-        short.sort_unstable();
-        assert_eq!(short, [vec![10, 11], vec![12]]);
-        assert_eq!(short_components(&rows, &setup, 3.0).len(), 3, "larger images");
+        let mut components = components(&rows, &setup);
+        components.iter_mut().for_each(|component| component.sort_unstable());
+        components.sort_unstable();
+        assert_eq!(short(&components, &rows, 1.0), [&vec![10, 11], &vec![12]]);
+        assert_eq!(short(&components, &rows, 3.0).len(), 3, "larger images");
     }
 }
