@@ -290,3 +290,52 @@ impl Observed {
         self.fine.n_phases
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::selftest::problems::small_dataset;
+    use glam::DVec3;
+
+    #[test]
+    fn binned_images_show_the_same_places() {
+        // The smaller side has 12 pixels: bins of 3 keep 4 of them, and leave out the last column and row.
+        let mut fine = small_dataset(13, 12, 3).unwrap();
+        let view = fine.training_views()[0];
+        let mut hidden = vec![false; 13 * 12];
+        hidden[5 * 13 + 7] = true;
+        fine.hidden.insert(view, hidden);
+        let coarse = binned_to(&fine, 4);
+        assert_eq!((coarse.width, coarse.height, coarse.views[view].size), (4, 4, [4, 4]));
+        assert_eq!(coarse.frames.len(), fine.training().len());
+
+        let (of_fine, of_coarse) = (&fine.training()[0], &coarse.frames[0]);
+        let bin = |x: usize, y: usize| {
+            (0..9).map(|k| of_fine.integrals[(3 * y + k / 3) * 13 + 3 * x + k % 3]).sum::<f32>() / 9.0
+        };
+        for (x, y) in [(0, 0), (2, 1), (3, 3)] {
+            let seen = of_coarse.integrals[y * 4 + x];
+            assert!((seen - bin(x, y)).abs() < 1e-5, "{x}, {y}: {seen}, {}", bin(x, y));
+        }
+        let hidden: Vec<usize> = (0..16).filter(|p| !coarse.shows(view, *p)).collect();
+        assert_eq!(hidden, [4 + 2], "a bin that is partly hidden is hidden");
+
+        let place = DVec3::new(0.1, -0.07, 0.05);
+        let at = |dataset: &Dataset| dataset.views[view].rays.project(place).unwrap();
+        let (fine, coarse) = (at(&fine), at(&coarse));
+        for (fine, coarse) in [(fine.0, coarse.0), (fine.1, coarse.1)] {
+            assert!(
+                ((fine + 0.5) / 3.0 - 0.5 - coarse).abs() < 1e-9,
+                "pixel {fine} is pixel {coarse} of the binned image"
+            );
+        }
+    }
+
+    #[test]
+    fn images_that_are_small_already_are_not_binned() {
+        let fine = small_dataset(13, 12, 3).unwrap();
+        let same = binned_to(&fine, 100);
+        assert_eq!((same.width, same.height), (13, 12));
+        assert_eq!(same.frames[0].integrals, fine.training()[0].integrals);
+    }
+}

@@ -471,6 +471,11 @@ mod tests {
     /// Images from the front and from the side of a vessel along the head's direction over a sloping background: exact chords, 8 x 8 of them
     /// in a pixel.
     fn dataset() -> Dataset {
+        dataset_with(|_, _| 1.0)
+    }
+
+    /// Images of a vessel whose radius a view shows enlarged by a factor of the place along the vessel, mm.
+    fn dataset_with(enlarged: impl Fn(usize, f64) -> f64) -> Dataset {
         let view = |primary_deg: f64| {
             let pixel_mm = [PIXEL_MM * 1e5 / 9e4; 2];
             let (sid_mm, sod_mm, zero) = (1e5, 9e4, [0.0; 2]);
@@ -484,7 +489,9 @@ mod tests {
             // World axes are (posterior, left, superior); the rays are parallel.
             let [left, posterior] = axis_mm(phase);
             let across = if view == 0 { anchor.y * MM_PER_UNIT - left } else { anchor.x * MM_PER_UNIT - posterior };
-            2.0 * PER_MM * (radius_mm(anchor.z * MM_PER_UNIT).powi(2) - across * across).max(0.0).sqrt()
+            let z = anchor.z * MM_PER_UNIT;
+            let shown_mm = enlarged(view, z) * radius_mm(z);
+            2.0 * PER_MM * (shown_mm.powi(2) - across * across).max(0.0).sqrt()
         };
         let pixel = |view: usize, phase: u32, p: usize| {
             let at = |k: usize| (k as f64 + 0.5) / 8.0 - 0.5;
@@ -564,6 +571,27 @@ mod tests {
         assert!(
             beat.phases.iter().all(|tree| tree.branches[0].radius_mm == branch.radius_mm),
             "points keep their radii"
+        );
+    }
+
+    #[test]
+    fn the_field_decides_where_halves_of_the_views_disagree() {
+        // One view shows a part of the vessel wider than the other one. Both together would give a radius of 0.87 mm.
+        let wider = |view: usize, z: f64| if view == 0 && z > -18.0 && z < -8.0 { 1.6 } else { 1.0 };
+        let field = 1.0;
+        let mut beat = tree();
+        beat.phases.iter_mut().for_each(|tree| tree.branches[0].radius_mm.fill(field));
+        measure_radii(&mut beat, &dataset_with(wider)).unwrap();
+        let branch = &beat.phases[0].branches[0];
+        let radius_at = |z: f64| {
+            let i = branch.points_mm.iter().position(|p| p.z > z).unwrap();
+            branch.radius_mm[i]
+        };
+        assert!((radius_at(-13.0) - field).abs() < 0.05, "{:?}", branch.radius_mm);
+        assert!(
+            (radius_at(12.0) - radius_mm(12.0)).abs() < 0.06,
+            "elsewhere the images decide: {:?}",
+            branch.radius_mm
         );
     }
 
