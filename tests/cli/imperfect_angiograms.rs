@@ -78,7 +78,12 @@ fn a_haze_behind_blades_is_no_vessel() {
         program().args(["train", text(&data), "-o", text(&run), "--seed", "4", "--stop-at", "130"]).output().unwrap();
     let told = String::from_utf8_lossy(&trained.stderr);
     assert!(trained.status.success(), "{told}");
-    assert!(told.contains("broader than the vessels and hidden from some view"), "{told}");
+    for fit in 1..=3 {
+        let left_out = format!(
+            "fit {fit} of 3: Gaussians that are left out, because they are broader than the vessels and hidden"
+        );
+        assert!(told.contains(&left_out), "{told}");
+    }
     let dice = read(&run.join("report/evaluation.json"))["dice"]["dynamic"].as_f64().unwrap();
     println!("Dice {dice:.3}");
     assert!(dice > 0.74, "{dice}");

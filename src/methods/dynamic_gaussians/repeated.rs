@@ -58,6 +58,8 @@ pub(crate) struct Repeated {
     fits: u32,
     /// Fields of the fits that are done.
     done: Vec<DynamicGaussians>,
+    /// Findings of these fits that were not taken yet.
+    findings: Vec<String>,
     /// Mean of these fields and of the fit that was made before, which is shown meanwhile.
     so_far: Option<DynamicGaussians>,
     fit: GaussianFit,
@@ -92,6 +94,7 @@ impl Repeated {
             config: config.clone(),
             fits: 1,
             done: Vec::new(),
+            findings: Vec::new(),
             so_far: None,
             was_coarse: fit.is_coarse(),
             fit,
@@ -140,6 +143,8 @@ impl Repeated {
         let end = self.config.gaussian_iterations();
         self.fit.advance(end)?;
         if self.fit.step() >= end {
+            let findings = self.findings_of_fit();
+            self.findings.extend(findings);
             self.done.push(self.fit.field()?);
             self.so_far = Some(self.mean_with(self.made.as_ref())?);
             let left = self.fits.saturating_sub(1 + self.done.len() as u32);
@@ -154,9 +159,17 @@ impl Repeated {
         Ok(Vec::new())
     }
 
-    /// Returns findings of the last fit about the data since the last call, for the user.
+    /// Returns findings of all fits about the data since the last call, for the user.
     pub(crate) fn take_findings(&mut self) -> Vec<String> {
-        if self.is_last() { self.fit.take_findings() } else { Vec::new() }
+        let last = if self.is_last() { self.findings_of_fit() } else { Vec::new() };
+        std::mem::take(&mut self.findings).into_iter().chain(last).collect()
+    }
+
+    /// Takes the findings of the fit that is made now, which name it where there are several.
+    fn findings_of_fit(&mut self) -> Vec<String> {
+        let (number, fits) = (self.done.len() + 1, self.fits);
+        let named = |finding| if fits > 1 { format!("fit {number} of {fits}: {finding}") } else { finding };
+        self.fit.take_findings().into_iter().map(named).collect()
     }
 
     /// Returns the images of a fit that is followed by so many others. The last fit takes them over.
