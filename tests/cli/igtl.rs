@@ -116,6 +116,7 @@ fn clients_get_the_overlay_its_place_and_the_vessels() {
     watcher.interrupt();
     let (said, well) = watcher.end();
     assert!(well, "{said}");
+    assert_eq!(said.matches("third column is no direction").count(), 1, "a client is warned of once: {said}");
     drop(stalled);
     // The vessels are those of the run at some phase.
     let tree = at("tree.json");

@@ -35,5 +35,22 @@ for _ in range(400):
 else:
     sys.exit(f"the picture stays at {moved.matrix[:3, 2]}, not {away}")
 assert not np.allclose(place.matrix[:3, 2], away, atol=0.1), "another direction than before"
+
+# A place that is none changes nothing, however often it is sent.
+for _ in range(3):
+    client.send_message(pyigtl.TransformMessage(np.zeros((4, 4)), device_name="CArm"), wait=True)
+for _ in range(40):
+    kept = client.wait_for_message("CArm", timeout=60)
+    assert np.allclose(kept.matrix[:3, 2], away, atol=1e-4), kept.matrix
 client.stop()
+
+# When that client has left, the picture is that of the first view again.
+other = pyigtl.OpenIGTLinkClient(host="127.0.0.1", port=int(sys.argv[1]))
+for _ in range(400):
+    back = other.wait_for_message("CArm", timeout=60)
+    if np.allclose(back.matrix, place.matrix, atol=1e-4):
+        break
+else:
+    sys.exit(f"the picture stays at {back.matrix[:3, 2]} when the client has left")
+other.stop()
 print("pyigtl: an overlay of", picture.image.shape, "at", place.matrix[:3, 3])

@@ -45,13 +45,22 @@ struct Newest {
     bytes: Arc<Vec<u8>>,
 }
 
+/// Place of a C-arm.
+#[derive(Clone, Copy)]
+struct Turned {
+    /// Address of the client that sent it.
+    by: SocketAddr,
+    primary_deg: f64,
+    secondary_deg: f64,
+}
+
 /// State that the threads share.
 #[derive(Default)]
 struct Shared {
     newest: Mutex<Newest>,
     changed: Condvar,
-    /// Primary and secondary angle of the pictures, deg; those of the first view where no client has sent a C-arm.
-    angles_deg: Mutex<Option<[f64; 2]>>,
+    /// Place of the C-arm that a connected client sent last; the pictures are those of the first view where there is none.
+    turned: Mutex<Option<Turned>>,
     clients: AtomicUsize,
     ended: AtomicBool,
 }
@@ -61,24 +70,29 @@ impl Shared {
         self.newest.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn angles_deg(&self) -> MutexGuard<'_, Option<[f64; 2]>> {
-        self.angles_deg.lock().unwrap_or_else(PoisonError::into_inner)
+    fn turned(&self) -> MutexGuard<'_, Option<Turned>> {
+        self.turned.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn has_ended(&self) -> bool {
         self.ended.load(Ordering::Acquire)
     }
 
-    /// Draws the pictures from the place of a C-arm that a client has sent; other messages are ignored.
-    fn follow(&self, message: &Received) {
+    /// Draws the pictures from the place of a C-arm that a client has sent, until it leaves. Returns false for a place that is none; other
+    /// messages are ignored.
+    fn follow(&self, by: SocketAddr, message: &Received) -> bool {
         if message.kind != TRANSFORM || message.device != C_ARM {
-            return;
+            return true;
         }
         let angles_deg = igtl::read_transform(&message.content).and_then(|[_, _, away, _]| angles_along(away));
-        match angles_deg {
-            Some(_) => *self.angles_deg() = angles_deg,
-            None => tracing::warn!("OpenIGTLink: a {TRANSFORM} {C_ARM} is ignored: its third column is no direction"),
-        }
+        let Some([primary_deg, secondary_deg]) = angles_deg else { return false };
+        *self.turned() = Some(Turned { by, primary_deg, secondary_deg });
+        true
+    }
+
+    /// Forgets the place of the C-arm that a client has sent.
+    fn forget(&self, client: SocketAddr) {
+        self.turned().take_if(|turned| turned.by == client);
     }
 }
 
@@ -138,13 +152,14 @@ fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
                 shared.clients.fetch_add(1, Ordering::AcqRel);
                 let (shared, own) = (shared.clone(), stream.try_clone());
                 let thread = std::thread::spawn(move || {
-                    let why = serve(stream, &shared).err().map_or("end".into(), |error| error.to_string());
+                    let why = serve(stream, from, &shared).err().map_or("end".into(), |error| error.to_string());
+                    shared.forget(from);
                     shared.clients.fetch_sub(1, Ordering::AcqRel);
                     tracing::info!("OpenIGTLink: {from} is disconnected: {why}");
                 });
                 threads.push((own, thread));
             }
-            Ok((_, from)) => tracing::warn!("OpenIGTLink: {from} is refused: {MAX_CLIENTS} clients are connected"),
+            Ok((_, from)) => eprintln!("warning: OpenIGTLink: {from} is refused: {MAX_CLIENTS} clients are connected"),
             Err(_) => std::thread::sleep(LOOK_EVERY),
         }
         threads.retain(|(_, thread)| !thread.is_finished());
@@ -157,13 +172,14 @@ fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
 }
 
 /// Sends the newest messages to a client whenever there are new ones.
-fn serve(mut stream: TcpStream, shared: &Shared) -> std::io::Result<()> {
+fn serve(mut stream: TcpStream, from: SocketAddr, shared: &Shared) -> std::io::Result<()> {
     stream.set_nonblocking(false)?;
     stream.set_nodelay(true)?;
     stream.set_write_timeout(Some(SENT_WITHIN))?;
     // The newest picture may be older than the connection.
     let mut sent = shared.newest().number;
     let mut reader = igtl::Reader::default();
+    let mut has_warned = false;
     loop {
         let bytes = {
             let unchanged = |newest: &mut Newest| newest.number == sent && !shared.has_ended();
@@ -180,7 +196,14 @@ fn serve(mut stream: TcpStream, shared: &Shared) -> std::io::Result<()> {
             stream.write_all(&bytes)?;
         }
         let is_there = receive(&mut stream, &mut reader)?;
-        std::iter::from_fn(|| reader.next_message()).for_each(|message| shared.follow(&message));
+        while let Some(message) = reader.next_message() {
+            // A client may send many of them per second.
+            if !shared.follow(from, &message) && !std::mem::replace(&mut has_warned, true) {
+                eprintln!(
+                    "warning: OpenIGTLink: {TRANSFORM} {C_ARM} of {from} is ignored where its third column is no direction"
+                );
+            }
+        }
         if !is_there {
             return Ok(());
         }
@@ -255,7 +278,8 @@ impl Beat {
                 self.look_for_vessels();
                 looked = Instant::now();
             }
-            match self.picture(phase, *shared.angles_deg()) {
+            let turned = *shared.turned();
+            match self.picture(phase, turned) {
                 Ok(bytes) => {
                     let mut newest = shared.newest();
                     *newest = Newest { number: newest.number + 1, bytes: Arc::new(bytes) };
@@ -298,11 +322,12 @@ impl Beat {
     }
 
     /// Returns the messages of a phase: the place of the C-arm, the overlay and the vessels. Pictures are those of the first view where no
-    /// angles are given.
-    fn picture(&self, phase: u32, angles_deg: Option<[f64; 2]>) -> Result<Vec<u8>> {
+    /// place is given.
+    fn picture(&self, phase: u32, turned: Option<Turned>) -> Result<Vec<u8>> {
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let taken = self.source.taken()?;
-        let [primary_deg, secondary_deg] = angles_deg.unwrap_or([taken.c_arm.primary_deg, taken.c_arm.secondary_deg]);
+        let first = [taken.c_arm.primary_deg, taken.c_arm.secondary_deg];
+        let [primary_deg, secondary_deg] = turned.map_or(first, |turned| [turned.primary_deg, turned.secondary_deg]);
         let rays = taken.turned(primary_deg, secondary_deg, usize::from(SIDE))?;
         let quantity = Quantity { component: Component::Dynamic, projection: Projection::Drr };
         let values = self.source.render(&rays, usize::from(SIDE), phase, quantity)?;
