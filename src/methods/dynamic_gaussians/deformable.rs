@@ -18,7 +18,7 @@ use crate::methods::dynamic_gaussians::catheter::Catheter;
 use crate::methods::dynamic_gaussians::filling::{Filling, FillingBuffers, from_set_of_phase};
 use crate::methods::dynamic_gaussians::members::{MemberBuffers, Members};
 use crate::methods::dynamic_gaussians::per_phase::{MAX_PASSES, check_count, strong};
-use crate::methods::dynamic_gaussians::pruning::{Judge, broad_parts, components, short};
+use crate::methods::dynamic_gaussians::pruning::{Judge, broad_parts, components, short_parts};
 use crate::methods::dynamic_gaussians::stages::{
     DeformableKernels, DeformablePass, GridBuffers, OwnMotion, OwnMotionBuffers, Track,
 };
@@ -447,7 +447,7 @@ impl DeformableTrainer {
         let (rows, setup) = (&members.particles.rows, &self.joint.setup);
         let components = components(rows, setup);
         let broad = broad_parts(&components, rows, setup);
-        let short = if self.prunes { short(&components, rows, self.targets.lengths.factor) } else { Vec::new() };
+        let short = if self.prunes { short_parts(&components, rows, self.targets.lengths.factor) } else { Vec::new() };
         if broad.is_empty() && short.is_empty() {
             return Ok(());
         }

@@ -31,8 +31,8 @@ const HIDDEN: f64 = 0.3;
 /// Deviation of a good fit without noise, as a share of the strongest change.
 const FIT_DEVIATION: f64 = 0.02;
 
-/// Returns the short ones of a set's components.
-pub(super) fn short<'a>(components: &'a [Vec<usize>], rows: &[Gaussian], factor: f64) -> Vec<&'a Vec<usize>> {
+/// Returns a set's components that are short.
+pub(super) fn short_parts<'a>(components: &'a [Vec<usize>], rows: &[Gaussian], factor: f64) -> Vec<&'a Vec<usize>> {
     let is_short = |members: &&Vec<usize>| extent(members.iter().map(|i| position(&rows[*i]))) <= SHORT * factor;
     components.iter().filter(is_short).collect()
 }
@@ -260,7 +260,7 @@ mod tests {
         let mut components = components(&rows, &setup);
         components.iter_mut().for_each(|component| component.sort_unstable());
         components.sort_unstable();
-        assert_eq!(short(&components, &rows, 1.0), [&vec![10, 11], &vec![12]]);
-        assert_eq!(short(&components, &rows, 3.0).len(), 3, "larger images");
+        assert_eq!(short_parts(&components, &rows, 1.0), [&vec![10, 11], &vec![12]]);
+        assert_eq!(short_parts(&components, &rows, 3.0).len(), 3, "larger images");
     }
 }
