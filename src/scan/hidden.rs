@@ -12,7 +12,12 @@ const AS_DARK: f32 = 1e-4;
 impl Dataset {
     /// Tells whether images of a view show the patient at a pixel.
     pub fn shows(&self, view: usize, pixel: usize) -> bool {
-        self.hidden.get(&view).is_none_or(|hidden| !hidden[pixel])
+        self.hidden_of(view).is_none_or(|hidden| !hidden[pixel])
+    }
+
+    /// Returns the pixels, row-major, where images of a view do not show the patient; `None` where there are none.
+    pub fn hidden_of(&self, view: usize) -> Option<&[bool]> {
+        self.hidden.get(&view).map(Vec::as_slice)
     }
 
     /// Finds the pixels that do not show the patient. A blade or a rim gives the same value in a whole image, the darkest of

@@ -159,8 +159,8 @@ fn planted_errors_of_poses_and_contrasts_are_found() {
     stepping.targets = field.targets.clone();
     stepping.set_contrasts(&poses);
     let misfit_before = misfit_at(&stepping, &poses);
-    for _ in 0..16 {
-        poses = stepping.step(&poses).unwrap();
+    for _ in 0..8 {
+        poses = stepping.stepped(&poses, 2).unwrap();
         println!("{:.3} px, contrast {:.3}", distance(&poses), contrast(&poses));
     }
     stepping.set_contrasts(&poses);

@@ -161,6 +161,17 @@ fn degenerate_scenes_are_answered() {
 }
 
 #[test]
+fn a_heart_that_hardly_moves_has_the_hull_of_one_that_rests() {
+    let rests = common::small_dataset(48, 48);
+    let mut moves = rests.clone();
+    moves.frames.iter_mut().for_each(|f| f.heart_shift_mm[2] = 1e-9);
+    assert!(moves.heart_shifts() && !rests.heart_shifts(), "points are projected for each phase, or once for all");
+    let [expected, found] = [&rests, &moves].map(|dataset| SoftMotion::new(dataset, 0.3, 32).hull);
+    assert!(expected.share() > 0.0);
+    assert_eq!(found.cells, expected.cells);
+}
+
+#[test]
 fn the_hull_as_bits_is_the_same_hull() {
     let dataset = common::small_dataset(32, 32);
     let soft = SoftMotion::new(&dataset, 0.3, 32).hull;

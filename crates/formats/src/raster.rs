@@ -84,23 +84,29 @@ pub fn opening(image: &Image, radius: usize) -> Image {
 /// Median over `2 radius + 1` pixels of each row, then of each column: removes structures that are narrower than half of this
 /// window in one or both directions.
 pub fn median_filter(image: &Image, radius: usize) -> Image {
-    let (w, h) = (image.width, image.height);
-    let window = |centre: usize, end: usize| centre.saturating_sub(radius)..(centre + radius + 1).min(end);
-    let mut values = Vec::with_capacity(2 * radius + 1);
-    let mut middle = |all: &mut dyn Iterator<Item = f32>| {
-        values.clear();
-        values.extend(all);
-        median(&mut values)
-    };
-    let mut rows = Image::zeros(w, h);
-    for (source, row) in image.values.chunks(w).zip(rows.values.chunks_mut(w)) {
-        for (x, out) in row.iter_mut().enumerate() {
-            *out = middle(&mut source[window(x, w)].iter().copied());
+    let rows = median_of_rows(image, radius);
+    median_of_rows(&rows.transposed(), radius).transposed()
+}
+
+/// Replaces each value by the median of its window in the row. The window is kept sorted while it moves along the row.
+fn median_of_rows(image: &Image, radius: usize) -> Image {
+    let radius = radius.min(image.width);
+    let mut sorted: Vec<f32> = Vec::with_capacity(2 * radius + 1);
+    let mut out = Image::zeros(image.width, image.height);
+    for (row, out) in image.values.chunks(image.width).zip(out.values.chunks_mut(image.width)) {
+        sorted.clear();
+        sorted.extend(&row[..radius.min(row.len())]);
+        sorted.sort_unstable_by(f32::total_cmp);
+        let place = |sorted: &[f32], value: f32| sorted.partition_point(|v| v.total_cmp(&value).is_lt());
+        for (x, out) in out.iter_mut().enumerate() {
+            if let Some(entering) = row.get(x + radius) {
+                sorted.insert(place(&sorted, *entering), *entering);
+            }
+            if let Some(left) = x.checked_sub(radius + 1) {
+                sorted.remove(place(&sorted, row[left]));
+            }
+            *out = sorted[sorted.len() / 2];
         }
-    }
-    let mut out = Image::zeros(w, h);
-    for (p, out) in out.values.iter_mut().enumerate() {
-        *out = middle(&mut window(p / w, h).map(|y| rows.values[y * w + p % w]));
     }
     out
 }
@@ -139,6 +145,23 @@ mod tests {
                 );
                 assert_eq!(min.values[y * w + x], picked(x, y, f32::INFINITY, f32::min), "{x}, {y} of {radius}");
             }
+        }
+    }
+
+    #[test]
+    fn windows_that_move_have_the_median_of_their_values() {
+        let (w, h) = (13, 7);
+        let values: Vec<f32> = (0..w * h).map(|p| ((p * 37 + 11) % 17) as f32 - 8.0).collect();
+        let image = Image { width: w, height: h, values };
+        let of = |values: &[f32], centre: usize, radius: usize| {
+            let mut window = values[centre.saturating_sub(radius)..(centre + radius + 1).min(values.len())].to_vec();
+            median(&mut window)
+        };
+        for radius in [0, 1, 2, 6, 12, 20] {
+            let rows: Vec<f32> = (0..w * h).map(|p| of(&image.values[p / w * w..][..w], p % w, radius)).collect();
+            let column = |x: usize| (0..h).map(|y| rows[y * w + x]).collect::<Vec<f32>>();
+            let expected: Vec<f32> = (0..w * h).map(|p| of(&column(p % w), p / w, radius)).collect();
+            assert_eq!(median_filter(&image, radius).values, expected, "radius {radius}");
         }
     }
 

@@ -28,7 +28,7 @@ use rayon::prelude::*;
 use residual::misfit;
 use step::FieldInLoop;
 
-/// Gauss-Newton steps per fit.
+/// Gauss-Newton steps per fit, all with the derivatives at the first poses: new derivatives for each step gave no better poses.
 const STEPS: usize = 3;
 /// Iterations of the first fit of a stage, which begins with seeds. Poses found by fits of 120 iterations, as long as that of a run, were no
 /// better.
@@ -161,11 +161,7 @@ impl Adjuster<'_> {
                 let fit = self.fit(&self.stands.at(&poses), &config, start, &mut || observe(share))?;
                 let Some(Fitted { trainer, .. }) = fit else { return Ok(None) };
                 earlier = Some(trainer.deformable()?).filter(|field| !field.rest.rows.is_empty());
-                let mut next = poses.clone();
-                let mut field = FieldInLoop::new(&trainer, &self.stands);
-                for _ in 0..STEPS {
-                    next = field.step(&next)?;
-                }
+                let next = FieldInLoop::new(&trainer, &self.stands).stepped(&poses, STEPS)?;
                 let change_px = self.stands.change_px(trainer.targets(), &poses, &next);
                 tracing::debug!("cycle {number} of the adjustment: {} Gaussians, {change_px:.3} px", trainer.count());
                 poses = extrapolated(&poses, &next, if number < N_CYCLES { FARTHER } else { 1.0 });

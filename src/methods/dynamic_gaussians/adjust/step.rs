@@ -1,4 +1,4 @@
-//! A Gauss-Newton step on poses, displacements of the heart and contrasts, with the field fixed.
+//! Gauss-Newton steps on poses, displacements of the heart and contrasts, with the field fixed.
 
 use crate::calibrate::pose::{Poses, ViewPose};
 use crate::error::{Error, Result};
@@ -69,30 +69,35 @@ impl<'a> FieldInLoop<'a> {
     /// Device errors.
     pub fn columns(&self, poses: &Poses) -> Result<Vec<Vec<f32>>> {
         let length = POSITION_STEP * self.targets.units.pixel;
-        let moved = |unknown: usize, step: f64| {
-            let mut moved = poses.clone();
-            moved.views.iter_mut().for_each(|pose| *pose = stepped(*pose, unknown, step));
-            self.drawn(&moved)
+        let drawn_after = |unknown: usize, step: f64| {
+            let mut poses = poses.clone();
+            poses.views.iter_mut().for_each(|pose| *pose = moved(*pose, unknown, step));
+            self.drawn(&poses)
         };
         let column = |k: usize| -> Result<Vec<f32>> {
             let step = if k < 2 { ANGLE_STEP_DEG } else { length };
-            let (ahead, behind) = (moved(k, step)?, moved(k, -step)?);
+            let (ahead, behind) = (drawn_after(k, step)?, drawn_after(k, -step)?);
             let slope = (0.5 / step) as f32;
             Ok(ahead.iter().zip(&behind).map(|(a, b)| (a - b) * slope).collect())
         };
         (0..OF_VIEW).map(column).collect()
     }
 
-    /// Makes a Gauss-Newton step and returns the poses after it.
+    /// Makes Gauss-Newton steps with the derivatives at the first poses, which take most of the time, and returns the poses after them.
     ///
     /// # Errors
     /// Device errors; [`Error::Internal`] when the equations cannot be solved.
-    pub fn step(&mut self, poses: &Poses) -> Result<Poses> {
+    pub fn stepped(&mut self, poses: &Poses, n_steps: usize) -> Result<Poses> {
+        let columns = self.columns(poses)?;
+        (0..n_steps).try_fold(poses.clone(), |poses, _| self.step(&poses, &columns))
+    }
+
+    /// Makes a step with such derivatives and returns the poses after it.
+    fn step(&mut self, poses: &Poses, columns: &[Vec<f32>]) -> Result<Poses> {
         self.set_contrasts(poses);
         let drawn = self.drawn(poses)?;
-        let columns = self.columns(poses)?;
         let images = active_images(&self.targets, &drawn);
-        let sums: Vec<Sums> = images.par_iter().map(|image| Sums::of(image, &drawn, &columns)).collect();
+        let sums: Vec<Sums> = images.par_iter().map(|image| Sums::of(image, &drawn, columns)).collect();
         let (squares, weights) = sums.iter().fold((0.0, 0.0), |(s, n), of| (s + of.squares, n + of.n_pixels));
         let variance = TEMPER * squares / f64::max(weights, 1.0);
         if variance <= 0.0 {
@@ -109,7 +114,7 @@ impl<'a> FieldInLoop<'a> {
         })?;
         let mut next = poses.clone();
         for (slot, pose) in next.views.iter_mut().enumerate() {
-            (0..OF_VIEW).for_each(|k| *pose = stepped(*pose, k, step[slot * OF_VIEW + k]));
+            (0..OF_VIEW).for_each(|k| *pose = moved(*pose, k, step[slot * OF_VIEW + k]));
         }
         for (k, image) in images.iter().enumerate() {
             let of = &step[unknowns.image(k)..][..OF_IMAGE];
@@ -162,7 +167,7 @@ impl<'a> FieldInLoop<'a> {
 }
 
 /// Returns a view's pose after a step of one unknown.
-fn stepped(mut pose: ViewPose, unknown: usize, step: f64) -> ViewPose {
+fn moved(mut pose: ViewPose, unknown: usize, step: f64) -> ViewPose {
     match unknown.checked_sub(2) {
         None => pose.angles_deg[unknown] += step,
         Some(axis) => pose.shift[axis] += step,

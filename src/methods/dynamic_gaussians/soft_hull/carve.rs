@@ -128,8 +128,26 @@ impl<'a> Votes<'a> {
 
     fn pixels(&self, point: DVec3, phase: usize, pixels: &mut [Option<usize>]) {
         for (pixel, of_view) in pixels.iter_mut().zip(&self.projectors) {
-            *pixel = of_view[if of_view.len() > 1 { phase } else { 0 }].pixel(point);
+            *pixel = projector_at(of_view, phase).pixel(point);
         }
+    }
+
+    /// Sum of the ratios at a phase over the views that see a point then; `None` where too few do, and where the views looked at so far
+    /// show that the sum cannot reach `least`: most points are settled by one or two views.
+    fn reaching(&self, point: DVec3, phase: usize, least: f32) -> Option<f32> {
+        let (mut sum, mut count, mut remaining) = (0.0, 0, self.n_at(phase));
+        for (view, of_view) in self.views.iter().zip(&self.projectors) {
+            let Some(ratio) = &view.ratios[phase] else { continue };
+            if sum + MOST * (remaining as f32) < least {
+                return None;
+            }
+            remaining -= 1;
+            if let Some(pixel) = projector_at(of_view, phase).pixel(point) {
+                sum += ratio.values[pixel];
+                count += 1;
+            }
+        }
+        (count >= self.needed).then_some(sum)
     }
 
     /// Sum of the ratios at a phase over the views that see the point then; `None` where too few do.
@@ -148,6 +166,11 @@ impl<'a> Votes<'a> {
     }
 }
 
+/// Returns the projector of a view at a phase.
+fn projector_at<'a>(of_view: &'a [Projector<'a>], phase: usize) -> &'a Projector<'a> {
+    &of_view[if of_view.len() > 1 { phase } else { 0 }]
+}
+
 fn centre(min: DVec3, cell: f64, n: usize, index: usize) -> DVec3 {
     let at = DVec3::new((index % n) as f64, (index / n % n) as f64, (index / (n * n)) as f64);
     min + (at + 0.5) * cell
@@ -158,6 +181,7 @@ fn centre(min: DVec3, cell: f64, n: usize, index: usize) -> DVec3 {
 fn support(votes: &Votes<'_>, min: DVec3, cell: f64, n: usize, n_phases: usize) -> Vec<Vec<f32>> {
     let least = MIN_SUPPORT * LEAST;
     let mut sums = vec![vec![least; n * n * n]; n_phases];
+    let moves = votes.moves();
     let slabs: Vec<Vec<f32>> = (0..n)
         .into_par_iter()
         .map(|z| {
@@ -166,7 +190,7 @@ fn support(votes: &Votes<'_>, min: DVec3, cell: f64, n: usize, n_phases: usize) 
             for at in 0..n * n {
                 let point = centre(min, cell, n, z * n * n + at);
                 for phase in 0..n_phases {
-                    if phase == 0 || votes.moves() {
+                    if phase == 0 || moves {
                         votes.pixels(point, phase, &mut pixels);
                     }
                     slab[phase * n * n + at] = votes.at(phase, &pixels).unwrap_or(least).max(least);
@@ -242,6 +266,7 @@ impl SoftHull {
         }
         let thresholds: Vec<f32> = (0..n_phases).map(|phase| threshold(votes.n_at(phase))).collect();
         let least = thresholds.iter().copied().fold(f32::MAX, f32::min);
+        let moves = votes.moves();
         let slabs: Vec<Vec<Vec<HullCell>>> = (0..n)
             .into_par_iter()
             .map(|z| {
@@ -255,17 +280,21 @@ impl SoftHull {
                         continue;
                     }
                     let point = centre(min, cell, n, index);
-                    votes.pixels(point, 0, &mut pixels);
-                    let hopeless = || votes.at_most(&pixels).is_none_or(|max| max + max_support[beside] < least);
-                    if !votes.moves() && hopeless() {
-                        continue;
+                    if !moves {
+                        votes.pixels(point, 0, &mut pixels);
+                        let largest = votes.at_most(&pixels);
+                        if largest.is_none_or(|max| max + max_support[beside] < least) {
+                            continue;
+                        }
                     }
                     for (phase, kept) in kept.iter_mut().enumerate() {
-                        if votes.moves() {
-                            votes.pixels(point, phase, &mut pixels);
-                        }
-                        let Some(sum) = votes.at(phase, &pixels) else { continue };
-                        let evidence = sum + support[phase][beside];
+                        let support = support[phase][beside];
+                        let sum = match moves {
+                            true => votes.reaching(point, phase, thresholds[phase] - support),
+                            false => votes.at(phase, &pixels),
+                        };
+                        let Some(sum) = sum else { continue };
+                        let evidence = sum + support;
                         if evidence >= thresholds[phase] {
                             kept.push(HullCell { index: index as u32, evidence });
                         }
