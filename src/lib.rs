@@ -263,8 +263,10 @@ pub mod trees {
     mod refine;
     mod ridges;
     mod sampled;
+    mod shadowed;
     mod shadows;
     pub mod sight;
+    mod slides;
     mod solid;
     mod tidy;
     pub mod tree;

@@ -1,4 +1,9 @@
-//! Symmetric positive definite systems: dense ones of some hundred unknowns, and banded ones of any size.
+//! Symmetric positive definite systems: dense ones of some hundred unknowns, banded ones of any size, and those that are given by their product
+//! with a vector.
+
+/// Maximum number of iterations of the conjugate gradients, and the residual at which they end, as a share of the right side.
+const MAX_ITERATIONS: usize = 200;
+const RESIDUAL: f64 = 1e-6;
 
 /// The lower triangle of a symmetric matrix, row by row.
 #[derive(Debug, Clone, PartialEq)]
@@ -114,6 +119,30 @@ impl Pentadiagonal {
     }
 }
 
+/// Solves a symmetric positive definite system that is given by its product with a vector, by conjugate gradients from `start`. It ends after
+/// 200 iterations at the latest, with the solution so far.
+pub fn conjugate_gradients(applied: impl Fn(&[f64]) -> Vec<f64>, right: &[f64], start: &[f64]) -> Vec<f64> {
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let mut x = start.to_vec();
+    let mut residual: Vec<f64> = right.iter().zip(applied(&x)).map(|(b, a)| b - a).collect();
+    let mut way = residual.clone();
+    let mut square = dot(&residual, &residual);
+    let enough = RESIDUAL.powi(2) * dot(right, right);
+    for _ in 0..MAX_ITERATIONS {
+        if square <= enough {
+            break;
+        }
+        let product = applied(&way);
+        let step = square / dot(&way, &product);
+        x.iter_mut().zip(&way).for_each(|(x, way)| *x += step * way);
+        residual.iter_mut().zip(&product).for_each(|(r, product)| *r -= step * product);
+        let next = dot(&residual, &residual);
+        way.iter_mut().zip(&residual).for_each(|(way, r)| *way = r + next / square * *way);
+        square = next;
+    }
+    x
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -150,5 +179,14 @@ mod tests {
             assert!(ours.iter().zip(&theirs).all(|(a, b)| (a - b).abs() < 1e-12), "{n}: {ours:?}, {theirs:?}");
         }
         assert_eq!(Pentadiagonal::zeros(3).solve(&[1.0; 3]), None);
+    }
+
+    #[test]
+    fn the_system_is_solved() {
+        // Diagonally dominant, symmetric.
+        let applied = |x: &[f64]| vec![4.0 * x[0] - x[1], 3.0 * x[1] - x[0] + 0.5 * x[2], 2.0 * x[2] + 0.5 * x[1]];
+        let wanted = [1.0, -2.0, 0.7];
+        let found = conjugate_gradients(applied, &applied(&wanted), &[0.0; 3]);
+        assert!(found.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?}");
     }
 }

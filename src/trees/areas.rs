@@ -3,35 +3,26 @@
 //! A field of limited resolution shows thin vessels and short stenoses blurred. Images show them blurred as well, but the sum of line
 //! integrals across the shadow of a vessel stays in proportion to its area, however thin it is. The areas of all points of a tree are
 //! found together by least squares: the shadows of the centrelines are added to the static background of each view, so that vessels that lie
-//! over each other in a view share its pixels.
+//! over each other in a view share its pixels. Errors of the places of points along their vessels are found beside the areas.
 
 use crate::calibrate::observed::binned_to;
-use crate::evidence::background::Background;
-use crate::evidence::series::{Series, blur};
-use crate::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
-use crate::raster::{Image, median, median_filter, percentile};
+use crate::evidence::series::Series;
+use crate::linear::conjugate_gradients;
+use crate::raster::percentile;
 use crate::scan::dataset::Dataset;
-use crate::trees::refine::tangents;
-use crate::trees::ridges::ridge_offset;
-use crate::trees::shadows::{PointShadow, Shadows};
-use crate::trees::tree::{BeatTree, Branch, PhaseTree, RadiiFrom};
-use glam::{DVec2, DVec3};
-use rayon::prelude::*;
+use crate::trees::shadowed::ShadowedView;
+use crate::trees::slides::Slides;
+use crate::trees::tree::{BeatTree, RadiiFrom};
 use std::f64::consts::PI;
 
 /// Minimum smaller side, pixels, of the binned images in which areas are measured.
 const SIDE: usize = 200;
-/// Standard deviation of the blur of images and shadows, pixels: errors of the places of centrelines matter less in blurred images.
-const BLUR_PX: f64 = 0.6;
-/// Error of a shadow, as a share of its line integral.
-const SHADOW_ERROR: f64 = 0.1;
-/// Residual from which a pixel loses weight, in standard deviations (Huber).
-const OUTLIER: f64 = 2.5;
 /// Difference of the areas that both halves of the views show, as a share of the typical area, at which half of what images add to the field
 /// is believed.
 const DISAGREEMENT: f64 = 0.25;
-/// Rounds of weights and areas.
+/// Rounds of weights and areas, and of slides, weights and areas after them.
 const ROUNDS: usize = 3;
+const SLIDING_ROUNDS: usize = 2;
 /// Standard deviation of the difference of an area from that of the field, as a share of the typical area.
 const FROM_FIELD: f64 = 1.0;
 /// Additional certainty of the field for vessels of two resolution lengths, in units of that for thin ones, and the power of the diameter with
@@ -51,24 +42,10 @@ const MIN_TYPICAL: f64 = 0.06;
 /// shared at bifurcations.
 const END_CERTAINTY: f64 = 300.0;
 const END_POINTS: f64 = 2.0;
-/// Largest distance of a centreline from the ridge of its shadow, pixels: a ridge farther away belongs to another vessel.
-const FARTHEST_RIDGE_PX: f64 = 1.6;
-/// Number of points on each side over which distances from ridges are averaged, and how many of them must have a ridge.
-const RIDGE_POINTS: usize = 4;
-const MIN_RIDGES: usize = 4;
-/// Share of the changes of a pixel from phase to phase that is an error of the shadows there.
-const OF_CHANGES: f64 = 0.4;
-/// Radius of the median filter of the changes from phase to phase, pixels.
-const STEADY_PX: usize = 2;
 /// Minimum number of views: radii of one alone could not be compared.
 const MIN_VIEWS: usize = 2;
-/// Minimum number of phases that a view must show: its static background is found from their differences.
-const MIN_PHASES: usize = 3;
 /// Minimum radius, in units of the field's resolution.
 const MIN_RADIUS: f64 = 0.03;
-/// Maximum number of iterations of the conjugate gradients, and the residual at which they end.
-const MAX_ITERATIONS: usize = 200;
-const RESIDUAL: f64 = 1e-6;
 
 /// Replaces the radii of a tree whose points are followed by those that the training images show. The dataset has the geometry that the
 /// reconstruction used.
@@ -92,12 +69,16 @@ pub fn measure_radii(beat: &mut BeatTree, dataset: &Dataset) -> Result<(), &'sta
         return Err("fewer than two training views show three phases of the tree");
     }
     let expected = Expected::new(&field, &lengths, beat.resolution_mm);
-    let mut areas = field.clone();
-    for _ in 0..ROUNDS {
-        views.iter_mut().for_each(|view| view.weigh(&areas));
-        areas = solved(&views.iter().collect::<Vec<_>>(), &expected, &areas);
+    let (mut areas, mut slides) = (field.clone(), Slides::none(&beat.phases));
+    for round in 0..ROUNDS + SLIDING_ROUNDS {
+        if round >= ROUNDS {
+            slides.improve(&views, &areas);
+        }
+        let at_phases = slides.at_phases(&areas);
+        views.iter_mut().for_each(|view| view.weigh(&at_phases));
+        areas = solved(&views.iter().collect::<Vec<_>>(), &slides, &expected, &areas);
     }
-    let areas = believed(&views, &expected, areas);
+    let areas = believed(&views, &slides, &expected, areas);
     let least_mm = MIN_RADIUS * beat.resolution_mm;
     let radii: Vec<f64> = areas.iter().map(|area| (area.max(0.0) / PI).sqrt().max(least_mm)).collect();
     for tree in &mut beat.phases {
@@ -110,207 +91,6 @@ pub fn measure_radii(beat: &mut BeatTree, dataset: &Dataset) -> Result<(), &'sta
     }
     beat.radii_from = RadiiFrom::Images;
     Ok(())
-}
-
-/// An image of a view and the shadows of the tree in it.
-struct ShadowedFrame {
-    shadows: Shadows,
-    /// Line integrals, blurred.
-    image: Vec<f64>,
-    weights: Vec<f64>,
-}
-
-/// The images of a view.
-struct ShadowedView {
-    frames: Vec<ShadowedFrame>,
-    /// Variance of each pixel of the blurred images: of its noise, and of a share of its changes from phase to phase.
-    variance: Vec<f64>,
-    /// Whether each pixel shows the patient.
-    shown: Vec<bool>,
-}
-
-impl ShadowedView {
-    /// Returns the images of a view that show phases of the tree; `None` where there are too few.
-    fn new(series: Series, dataset: &Dataset, phases: &[PhaseTree], attenuation: f64) -> Option<ShadowedView> {
-        let background = Background::new(series);
-        let view = background.stilled.view;
-        let size = dataset.views[view].size;
-        let frame = |tree: &PhaseTree| {
-            let image = background.stilled.images.get(tree.phase as usize)?.as_ref()?;
-            let change = background.changes.get(tree.phase as usize)?.as_ref()?;
-            let projection = Projection {
-                rays: dataset.heart_rays_at(view, tree.phase),
-                attenuation: attenuation * dataset.contrast_at(view, tree.phase),
-                change,
-                strongest: background.strongest,
-            };
-            let image = blur(image, BLUR_PX as f32).values.into_iter().map(f64::from).collect();
-            Some(ShadowedFrame { shadows: projection.shadows(tree, size), image, weights: Vec::new() })
-        };
-        let frames: Vec<ShadowedFrame> = phases.par_iter().filter_map(frame).collect();
-        if frames.len() < MIN_PHASES {
-            return None;
-        }
-        let noise =
-            background.noise.values.iter().map(|noise| f64::from(*noise).powi(2) / (4.0 * PI * BLUR_PX.powi(2)));
-        let variance = noise
-            .zip(unsteadiness(&frames, size))
-            .map(|(noise, changes)| noise + (OF_CHANGES * changes).powi(2))
-            .collect();
-        let on_canvas = |p: usize| p / size[0] * dataset.width + p % size[0];
-        let shown = (0..size[0] * size[1]).map(|p| dataset.shows(view, on_canvas(p))).collect();
-        Some(ShadowedView { frames, variance, shown })
-    }
-
-    fn n_pixels(&self) -> usize {
-        self.variance.len()
-    }
-
-    /// Sets the weights of all pixels for areas: the inverse of their variances, less for outliers and none for hidden pixels.
-    fn weigh(&mut self, areas: &[f64]) {
-        let n = self.n_pixels();
-        let models: Vec<Vec<f64>> = self.frames.par_iter().map(|frame| frame.shadows.image(areas, n)).collect();
-        let residual = |k: usize, p: usize| self.frames[k].image[p] - models[k][p];
-        let static_level = |p: usize| {
-            let mut values: Vec<f32> = (0..models.len()).map(|k| residual(k, p) as f32).collect();
-            f64::from(median(&mut values))
-        };
-        let levels: Vec<f64> = (0..n).into_par_iter().map(static_level).collect();
-        // Neighbours of a blurred image hold the same information.
-        let shared = 1.0 + 4.0 * PI * BLUR_PX.powi(2);
-        let weight = |k: usize, p: usize| {
-            if !self.shown[p] {
-                return 0.0;
-            }
-            let variance = self.variance[p] + (SHADOW_ERROR * models[k][p]).powi(2);
-            let away = (residual(k, p) - levels[p]).abs() / variance.sqrt();
-            (OUTLIER / away.max(OUTLIER)) / (variance * shared)
-        };
-        let weights: Vec<Vec<f64>> =
-            (0..models.len()).into_par_iter().map(|k| (0..n).map(|p| weight(k, p)).collect()).collect();
-        self.frames.iter_mut().zip(weights).for_each(|(frame, weights)| frame.weights = weights);
-    }
-
-    /// Adds to each point the weighted sums of images, one for each frame, without their weighted means over the frames: the static background
-    /// of a pixel is unknown.
-    fn add_sums(&self, images: &[Vec<f64>], sums: &mut [f64]) {
-        let mean = |p: usize| {
-            let (mut sum, mut weights) = (0.0, 0.0);
-            for (frame, image) in self.frames.iter().zip(images) {
-                sum += frame.weights[p] * image[p];
-                weights += frame.weights[p];
-            }
-            if weights > 0.0 { sum / weights } else { 0.0 }
-        };
-        let means: Vec<f64> = (0..self.n_pixels()).into_par_iter().map(mean).collect();
-        let of_frame = |(frame, image): (&ShadowedFrame, &Vec<f64>)| {
-            let weighted: Vec<f64> =
-                image.iter().zip(&means).zip(&frame.weights).map(|((value, mean), w)| w * (value - mean)).collect();
-            let mut own = vec![0.0; sums.len()];
-            frame.shadows.add_sums(&weighted, &mut own);
-            own
-        };
-        let all: Vec<Vec<f64>> = self.frames.par_iter().zip(images).map(of_frame).collect();
-        all.iter().for_each(|own| sums.iter_mut().zip(own).for_each(|(sum, value)| *sum += value));
-    }
-
-    /// Returns the line integrals of vessels with areas in all frames.
-    fn images(&self, areas: &[f64]) -> Vec<Vec<f64>> {
-        self.frames.par_iter().map(|frame| frame.shadows.image(areas, self.n_pixels())).collect()
-    }
-}
-
-/// Returns the standard deviation of each pixel from phase to phase. Where shadows pass, it includes errors of their places.
-fn unsteadiness(frames: &[ShadowedFrame], [width, height]: [usize; 2]) -> impl Iterator<Item = f64> {
-    // Ratio of a normal distribution's standard deviation to its median absolute value, for differences of two values.
-    const MEDIAN_TO_DEVIATION: f32 = 1.4826 / std::f32::consts::SQRT_2;
-    let at = |p: usize| {
-        let mut steps: Vec<f32> =
-            frames.windows(2).map(|pair| (pair[1].image[p] - pair[0].image[p]).abs() as f32).collect();
-        MEDIAN_TO_DEVIATION * median(&mut steps)
-    };
-    let values = (0..width * height).into_par_iter().map(at).collect();
-    median_filter(&Image { width, height, values }, STEADY_PX).values.into_iter().map(f64::from)
-}
-
-/// An image of a view and how the tree is projected into it.
-struct Projection<'a> {
-    /// Rays that see the heart.
-    rays: ViewRays,
-    /// Attenuation of the vessels in the image, per mm.
-    attenuation: f64,
-    change: &'a Image,
-    strongest: f32,
-}
-
-impl Projection<'_> {
-    /// Returns the shadows of the points of a tree in an image of a size.
-    fn shadows(&self, tree: &PhaseTree, size: [usize; 2]) -> Shadows {
-        let starts = tree.branches.iter().scan(0, |next, branch| {
-            let start = *next;
-            *next += branch.points_mm.len();
-            Some(start)
-        });
-        let all = tree.branches.iter().zip(starts).flat_map(|(branch, start)| self.of_branch(branch, start));
-        Shadows::new(all, size)
-    }
-
-    /// Returns the shadows of the points of a branch, whose first point has an index.
-    fn of_branch(&self, branch: &Branch, start: usize) -> Vec<PointShadow> {
-        let points = &branch.points_mm;
-        let last = points.len() - 1;
-        let length_mm = |i: usize| {
-            let [before, behind] = [points[i.saturating_sub(1)], points[(i + 1).min(last)]];
-            0.5 * (before.distance(points[i]) + points[i].distance(behind))
-        };
-        let moved = self.moved_to_ridges(branch);
-        let shadow = |i: usize| {
-            let centre = moved[i]?;
-            let pixel_mm2 = self.pixel_mm2(points[i]);
-            let radius_px = branch.radius_mm[i] / pixel_mm2.sqrt();
-            Some(PointShadow {
-                point: start + i,
-                centre,
-                // Variances of a disc, of a pixel and of the blur.
-                deviation_px: (radius_px.powi(2) / 4.0 + 1.0 / 12.0 + BLUR_PX.powi(2)).sqrt(),
-                sum: self.attenuation * length_mm(i) / pixel_mm2,
-            })
-        };
-        (0..points.len()).filter_map(shadow).collect()
-    }
-
-    /// Returns the area of a pixel at a point, perpendicular to the ray, mm^2.
-    fn pixel_mm2(&self, point_mm: DVec3) -> f64 {
-        let away = world_from_lps_mm(point_mm) - self.rays.source();
-        let depth_mm = away.dot(self.rays.axis()).abs() * MM_PER_UNIT;
-        let obliquity = away.normalize_or(self.rays.axis()).dot(self.rays.axis()).abs();
-        self.rays.direction[1].cross(self.rays.direction[2]).length() * depth_mm.powi(2) * obliquity
-    }
-
-    fn projected(&self, point_mm: DVec3) -> Option<DVec2> {
-        self.rays.project(world_from_lps_mm(point_mm)).map(|(column, row)| DVec2::new(column, row))
-    }
-
-    /// Returns the points of a branch in the image, moved across the vessel to the ridge that the image shows nearby; `None` behind the source.
-    fn moved_to_ridges(&self, branch: &Branch) -> Vec<Option<DVec2>> {
-        let tangents = tangents(&branch.points_mm);
-        let places: Vec<Option<DVec2>> = branch.points_mm.iter().map(|point| self.projected(*point)).collect();
-        let across = |i: usize| {
-            let ahead = self.projected(branch.points_mm[i] + tangents[i])?;
-            (ahead - places[i]?).perp().try_normalize()
-        };
-        let offset = |i: usize| {
-            let found = ridge_offset(self.change, self.strongest, places[i]?, across(i)?)?;
-            (found.abs() <= FARTHEST_RIDGE_PX).then_some(found as f32)
-        };
-        let offsets: Vec<Option<f32>> = (0..places.len()).map(offset).collect();
-        let smooth = |i: usize| {
-            let around = &offsets[i.saturating_sub(RIDGE_POINTS)..(i + RIDGE_POINTS + 1).min(offsets.len())];
-            let mut known: Vec<f32> = around.iter().copied().flatten().collect();
-            if known.len() < MIN_RIDGES { 0.0 } else { f64::from(median(&mut known)) }
-        };
-        (0..places.len()).map(|i| Some(places[i]? + across(i).unwrap_or(DVec2::ZERO) * smooth(i))).collect()
-    }
 }
 
 /// Areas that are expected before the images are compared, and how certain they are.
@@ -388,28 +168,34 @@ fn typical(areas: &[f64]) -> Vec<f64> {
 }
 
 /// Returns the areas that explain the images best, by conjugate gradients from given areas.
-fn solved(views: &[&ShadowedView], expected: &Expected<'_>, start: &[f64]) -> Vec<f64> {
+fn solved(views: &[&ShadowedView], slides: &Slides, expected: &Expected<'_>, start: &[f64]) -> Vec<f64> {
     let smoothness = expected.smoothness(start);
+    let add_sums = |view: &ShadowedView, images: &[Vec<f64>], sums: &mut [f64]| {
+        for (frame, of_phase) in view.frames.iter().zip(view.sums(images, sums.len())) {
+            slides.add_transposed(frame.phase, &of_phase, sums);
+        }
+    };
     let applied = |areas: &[f64]| {
         let mut out = expected.applied(&smoothness, areas);
-        views.iter().for_each(|view| view.add_sums(&view.images(areas), &mut out));
+        let at_phases = slides.at_phases(areas);
+        views.iter().for_each(|view| add_sums(view, &view.images(&at_phases), &mut out));
         out
     };
     let mut right: Vec<f64> =
         expected.field.iter().zip(&expected.certainty).map(|(area, weight)| area * weight).collect();
     for view in views {
         let images: Vec<Vec<f64>> = view.frames.iter().map(|frame| frame.image.clone()).collect();
-        view.add_sums(&images, &mut right);
+        add_sums(view, &images, &mut right);
     }
     conjugate_gradients(applied, &right, start)
 }
 
 /// Returns the areas where both halves of the views agree on them, and those of the field where they do not: where vessels lie over each other in
 /// some views, shadows there may be shared wrongly.
-fn believed(views: &[ShadowedView], expected: &Expected<'_>, areas: Vec<f64>) -> Vec<f64> {
+fn believed(views: &[ShadowedView], slides: &Slides, expected: &Expected<'_>, areas: Vec<f64>) -> Vec<f64> {
     let half = |first: usize| {
         let own: Vec<&ShadowedView> = views.iter().skip(first).step_by(2).collect();
-        solved(&own, expected, &areas)
+        solved(&own, slides, expected, &areas)
     };
     let (even, odd) = (half(0), half(1));
     let share = |i: usize| {
@@ -419,34 +205,13 @@ fn believed(views: &[ShadowedView], expected: &Expected<'_>, areas: Vec<f64>) ->
     (0..areas.len()).map(|i| expected.field[i] + share(i) * (areas[i] - expected.field[i])).collect()
 }
 
-/// Solves a symmetric positive definite system that is given by its product with a vector.
-fn conjugate_gradients(applied: impl Fn(&[f64]) -> Vec<f64>, right: &[f64], start: &[f64]) -> Vec<f64> {
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    let mut x = start.to_vec();
-    let mut residual: Vec<f64> = right.iter().zip(applied(&x)).map(|(b, a)| b - a).collect();
-    let mut way = residual.clone();
-    let mut square = dot(&residual, &residual);
-    let enough = RESIDUAL.powi(2) * dot(right, right);
-    for _ in 0..MAX_ITERATIONS {
-        if square <= enough {
-            break;
-        }
-        let product = applied(&way);
-        let step = square / dot(&way, &product);
-        x.iter_mut().zip(&way).for_each(|(x, way)| *x += step * way);
-        residual.iter_mut().zip(&product).for_each(|(r, product)| *r -= step * product);
-        let next = dot(&residual, &residual);
-        way.iter_mut().zip(&residual).for_each(|(way, r)| *way = r + next / square * *way);
-        square = next;
-    }
-    x
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::{CArm, Geometry};
+    use crate::geometry::{CArm, Geometry, MM_PER_UNIT};
     use crate::scan::dataset::{Frame, Layout, Split, View};
+    use crate::trees::tree::{Branch, PhaseTree};
+    use glam::DVec3;
 
     const PER_MM: f64 = 0.1;
     const PIXEL_MM: f64 = 1.6;
@@ -575,6 +340,24 @@ mod tests {
     }
 
     #[test]
+    fn a_stenosis_is_shown_in_full_though_points_slide_along_the_vessel() {
+        let mut beat = tree();
+        for (phase, along_mm) in beat.phases.iter_mut().zip([2.0, -2.0, 1.5, -1.5, 0.0]) {
+            phase.branches[0].points_mm.iter_mut().for_each(|point| point.z += along_mm);
+        }
+        measure_radii(&mut beat, &dataset()).unwrap();
+        // The last phase is in the middle of the others. Without slides, the least radius is 0.34 instead of 0.28 mm, and 2.2 mm away.
+        let branch = &beat.phases[4].branches[0];
+        let (least, at) =
+            (28..42).map(|i| (branch.radius_mm[i], branch.points_mm[i].z)).min_by(|a, b| a.0.total_cmp(&b.0)).unwrap();
+        assert!(
+            (least - radius_mm(4.0)).abs() < 0.05 && (at - 4.0).abs() < 1.5,
+            "{least} mm at {at}: {:?}",
+            branch.radius_mm
+        );
+    }
+
+    #[test]
     fn the_field_decides_where_halves_of_the_views_disagree() {
         // One view shows a part of the vessel wider than the other one. Both together would give a radius of 0.87 mm.
         let wider = |view: usize, z: f64| if view == 0 && z > -18.0 && z < -8.0 { 1.6 } else { 1.0 };
@@ -612,14 +395,5 @@ mod tests {
         let mut one_view = dataset.clone();
         one_view.frames.retain(|frame| frame.view == 0);
         refused(&mut tree(), &one_view, "two training views");
-    }
-
-    #[test]
-    fn the_system_is_solved() {
-        // Diagonally dominant, symmetric.
-        let applied = |x: &[f64]| vec![4.0 * x[0] - x[1], 3.0 * x[1] - x[0] + 0.5 * x[2], 2.0 * x[2] + 0.5 * x[1]];
-        let wanted = [1.0, -2.0, 0.7];
-        let found = conjugate_gradients(applied, &applied(&wanted), &[0.0; 3]);
-        assert!(found.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?}");
     }
 }
