@@ -63,6 +63,9 @@ pub fn measure_radii(beat: &mut BeatTree, dataset: &Dataset) -> Result<(), &'sta
     let first = beat.phases.first().ok_or("the tree has no phase")?;
     let field: Vec<f64> = first.branches.iter().flat_map(|b| &b.radius_mm).map(|r| PI * r * r).collect();
     let lengths: Vec<usize> = first.branches.iter().map(|branch| branch.points_mm.len()).collect();
+    if field.is_empty() {
+        return Err("the tree has no points");
+    }
     let dataset = &binned_to(dataset, SIDE);
     let of_view = |series: Series| ShadowedView::new(series, dataset, &beat.phases, attenuation);
     let mut views: Vec<ShadowedView> = Series::each(dataset).filter_map(of_view).collect();
@@ -393,6 +396,9 @@ mod tests {
         short.keep_phases(&[0, 4]);
         assert_eq!(short.phases.iter().map(|tree| tree.phase).collect::<Vec<_>>(), [0, 4]);
         refused(&mut short, &dataset, "three phases");
+        let mut empty = tree();
+        empty.phases.iter_mut().for_each(|tree| tree.branches.clear());
+        refused(&mut empty, &dataset, "no points");
         let mut one_view = dataset.clone();
         one_view.frames.retain(|frame| frame.view == 0);
         refused(&mut tree(), &one_view, "two training views");
