@@ -291,13 +291,16 @@ fn the_mean_of_fits_holds_all_of_them_and_their_agreement() {
         (losses, trainer.model().unwrap().gaussians.unwrap())
     };
     for form in ["phase", "tree"] {
-        let members = [field(form, 1001, 1), field(form, 1, 1)];
+        let members = [field(form, 1, 1), field(form, 1001, 1)];
         let (losses, mean) = field(form, 1, 2);
-        assert_eq!(losses[..20], members[1].0[..20], "the losses are those of the run's seed");
+        assert_eq!(losses[..20], members[0].0[..20], "the losses are those of the run's seed");
+        // The second fit of a deformable set takes its motion from the first one, so it is not that of its seed alone.
+        let is_whole = form == "phase";
         for phase in [0, 2] {
-            let want: Vec<_> = members.iter().flat_map(|(_, member)| member.at(phase)).collect();
+            let known = members.iter().take(if is_whole { 2 } else { 1 });
+            let want: Vec<_> = known.flat_map(|(_, member)| member.at(phase)).collect();
             let got = mean.at(phase);
-            assert_eq!(got.len(), want.len());
+            assert!(if is_whole { got.len() == want.len() } else { got.len() > want.len() }, "{form}: {}", got.len());
             for (got, want) in got.iter().zip(&want) {
                 assert!((got.log_density - want.log_density - (2.0f32 / 3.0).ln()).abs() < 1e-5);
                 let apart = (0..3).map(|k| (got.position[k] - want.position[k]).abs()).fold(0.0, f32::max);

@@ -8,7 +8,7 @@ use nertca_vk::config::sections;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Result;
 use nertca_vk::fields::scale::dynamic_half;
-use nertca_vk::gaussians::field::Gaussians;
+use nertca_vk::gaussians::field::{DeformableGaussians, Gaussians};
 use nertca_vk::gaussians::particles::Particles;
 use nertca_vk::gaussians::view::SplatView;
 use nertca_vk::gpu::device::Gpu;
@@ -344,6 +344,47 @@ fn train_tree(gpu: &Gpu, targets: Targets, config: &Config) -> Result<Gaussians>
         trainer.advance(until)?;
     }
     Ok(trainer.deformable()?.expand())
+}
+
+/// Another seed keeps the motion of a fit and nothing else.
+#[test]
+fn a_reseeded_fit_moves_as_the_earlier_one_and_has_gaussians_of_its_own() {
+    let gpu = gpu();
+    let directory = tempfile::tempdir().unwrap();
+    let dataset = phantom(&gpu, directory.path(), 40, 4);
+    let config = with_gaussians(sections::Gaussians { iterations: 30, ..config().gaussians });
+    let fitted = |trainer: &mut DeformableTrainer| {
+        let mut losses = Vec::new();
+        while trainer.step() < config.gaussians.iterations {
+            losses.extend(trainer.advance(config.gaussians.iterations).unwrap());
+        }
+        losses
+    };
+    let mut first = DeformableTrainer::new(&gpu, targets_of(&dataset), &config).unwrap();
+    fitted(&mut first);
+    let earlier = first.deformable().unwrap();
+    let other = Config { seed: config.seed + 1, ..config.clone() };
+    let mut second = DeformableTrainer::reseeded(&gpu, targets_of(&dataset), &other, &earlier).unwrap();
+    let seeded = second.deformable().unwrap();
+    assert_eq!((second.step(), seeded.rest.rows.len()), (0, config.gaussians.count as usize));
+    let n_basis = seeded.setup.n_basis as usize;
+    let own = |set: &DeformableGaussians, i: usize| set.own[i * n_basis..][..n_basis].to_vec();
+    let mut farthest = 0f64;
+    for (i, g) in seeded.rest.rows.iter().enumerate() {
+        assert_eq!(g.phase, seeded.setup.rest_phase);
+        let x = DVec3::from_array(g.position.map(f64::from));
+        let moved = [&seeded, &earlier].map(|set| set.carried(x, 2.0));
+        assert!(moved[0].distance(moved[1]) < 1e-3, "{} and {}", moved[0], moved[1]);
+        assert_eq!(own(&seeded, i), own(&earlier, earlier.nearest(x)));
+        farthest = farthest.max(moved[0].distance(x));
+        assert!(earlier.rest.rows.iter().all(|other| other.position != g.position));
+    }
+    let losses = fitted(&mut second);
+    println!("displacements of up to {farthest} pixels, loss {} to {}", losses[0], losses[29]);
+    assert!(farthest > 0.3, "the earlier fit moves: {farthest} pixels");
+    assert!(losses[29] < 0.5 * losses[0], "{losses:?}");
+    drop((first, second));
+    expect_silence(gpu);
 }
 
 /// Mean Dice over the validation images, where the maximum attenuation along the ray is at least a fifth of the vessel's.

@@ -97,8 +97,10 @@ pub(super) fn adjust(task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result
 enum Start<'a> {
     /// Seeds, all iterations, and pruning, as in the run.
     Run,
-    /// Seeds, a few iterations. Nothing is pruned here and in the next kind, because wrong poses take the support from ends of vessels.
+    /// Seeds, a few iterations. Nothing is pruned here and in the next kinds, because wrong poses take the support from ends of vessels.
     Seeds,
+    /// Seeds that move as the field of the stage before; a few iterations.
+    Reseeded(&'a DeformableGaussians),
     /// The field of the fit before, at slightly different poses; a few iterations.
     Earlier(&'a DeformableGaussians),
 }
@@ -148,16 +150,20 @@ impl Adjuster<'_> {
     /// Finds poses in cycles of a fit and a step of the poses.
     fn found(&self, start: Poses, observe: &mut Observe<'_>) -> Result<Option<Poses>> {
         let (mut poses, mut number) = (start, 0);
+        let mut earlier: Option<DeformableGaussians> = None;
         for stage in &STAGES {
-            let end = number + stage.cycles;
-            let mut earlier: Option<DeformableGaussians> = None;
+            let (first, end) = (number + 1, number + stage.cycles);
             while number < end {
                 number += 1;
                 // The fits before and after the cycles count as well.
                 let share = f64::from(number) / f64::from(N_CYCLES + 2);
                 let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
                 let config = stage.config(self.config, seed);
-                let start = earlier.as_ref().map_or(Start::Seeds, Start::Earlier);
+                let start = match &earlier {
+                    None => Start::Seeds,
+                    Some(field) if number == first => Start::Reseeded(field),
+                    Some(field) => Start::Earlier(field),
+                };
                 let fit = self.fit(&self.stands.at(&poses), &config, start, &mut || observe(share))?;
                 let Some(Fitted { trainer, .. }) = fit else { return Ok(None) };
                 earlier = Some(trainer.deformable()?).filter(|field| !field.rest.rows.is_empty());
@@ -226,6 +232,7 @@ impl Adjuster<'_> {
         let fingerprint = fingerprint(&targets, config);
         let mut trainer = match start {
             Start::Run | Start::Seeds => DeformableTrainer::new(self.gpu, targets, config)?,
+            Start::Reseeded(earlier) => DeformableTrainer::reseeded(self.gpu, targets, config, earlier)?,
             Start::Earlier(earlier) => DeformableTrainer::going_on(self.gpu, targets, config, earlier, from)?,
         };
         if !matches!(start, Start::Run) {
@@ -246,7 +253,7 @@ impl Start<'_> {
         let mut config = config.clone();
         config.gaussians.iterations = match self {
             Start::Run => config.gaussians.iterations,
-            Start::Seeds => FIRST_ITERATIONS.min(config.gaussians.iterations),
+            Start::Seeds | Start::Reseeded(_) => FIRST_ITERATIONS.min(config.gaussians.iterations),
             Start::Earlier(_) => carried_step(&config.gaussians) + MORE_ITERATIONS,
         };
         config

@@ -343,9 +343,7 @@ impl DeformableTrainer {
         let clear = setup::clears(settings, self.step);
         let stop = setup::next_stop(settings, self.step, until);
         if renew {
-            let images = self.images()?;
-            let renewal = self.renewal();
-            renew_bounds(&self.gpu, &mut self.targets, &self.joint.parts, &self.joint.setup, &images, renewal)?;
+            self.renew_background()?;
         }
         if grow {
             self.grow()?;
@@ -368,6 +366,20 @@ impl DeformableTrainer {
         losses(&self.gpu, &self.joint.targets.gaussian_ring, first..self.step, SMALLER_STEPS)
     }
 
+    /// Estimates the static background anew from what the Gaussians leave of the images, and with it the bounds of the fit's targets.
+    pub(super) fn renew_background(&mut self) -> Result<()> {
+        let (images, renewal) = (self.images()?, self.renewal());
+        renew_bounds(&self.gpu, &mut self.targets, &self.joint.parts, &self.joint.setup, &images, renewal)
+    }
+
+    /// Replaces all Gaussians by others of the rest phase, each of which moves and is filled as its nearest neighbour in `deformable`, a
+    /// set on the grid of this fit.
+    pub(super) fn reseed(&mut self, rows: Vec<Gaussian>, deformable: &DeformableGaussians) -> Result<()> {
+        let mut members = Members::none(self.members.filling.is_some());
+        members.append(rows, deformable);
+        self.replace(&members)
+    }
+
     /// Drops weak Gaussians and places new ones where data are missing at half the phases. This happens once in a run, on the
     /// host, as with a set per phase.
     fn grow(&mut self) -> Result<()> {
@@ -381,16 +393,7 @@ impl DeformableTrainer {
         let (settings, seed) = (self.targets.lengths.gaussians(&self.config.gaussians), self.config.seed);
         let additions =
             seeds::deformable_additions(&self.targets, &settings, seed, &self.images()?, carried, is_filled);
-        // New Gaussians move and are filled as their nearest neighbours.
-        let (n_basis, n_phases) = (self.joint.deformable.n_basis as usize, self.targets.n_phases);
-        for g in &additions {
-            let nearest = deformable.nearest(DVec3::from_array(g.position.map(f64::from)));
-            members.own.append(deformable.own[nearest * n_basis..][..n_basis].to_vec());
-            if let (Some(filling), Some(values)) = (&mut members.filling, &deformable.filling) {
-                filling.append(values[nearest * n_phases..][..n_phases].to_vec());
-            }
-        }
-        members.particles.append(additions);
+        members.append(additions, &deformable);
         self.replace(&members)
     }
 

@@ -43,6 +43,24 @@ impl GaussianFit {
         })
     }
 
+    /// Begins a fit from new seeds that move as an earlier fit to the same images, where there is one set for the beat.
+    ///
+    /// # Errors
+    /// As [`GaussianFit::new`] and [`DeformableTrainer::with`].
+    pub(crate) fn reseeded(
+        gpu: &Gpu,
+        targets: Targets,
+        config: &Config,
+        earlier: &DynamicGaussians,
+    ) -> Result<GaussianFit> {
+        let Some(earlier) = earlier.deformable().filter(|earlier| !earlier.rest.rows.is_empty()) else {
+            return GaussianFit::new(gpu, targets, config);
+        };
+        let (targets, fine) = Fine::split(gpu, targets, config);
+        let fit = DeformableTrainer::reseeded(gpu, targets, config, earlier)?;
+        Ok(GaussianFit::Deformable(Box::new(fit), fine))
+    }
+
     /// As [`GaussianFit::new`], but goes on from what was fitted to `earlier` data where that is of use.
     ///
     /// # Errors

@@ -23,6 +23,12 @@ impl Made {
         (whole && made.fingerprint == fingerprint(targets, config)).then(|| Made { fit: made.clone(), step: 0 })
     }
 
+    /// Takes a fit that is done.
+    pub(crate) fn done(gaussians: DynamicGaussians, losses: Vec<f64>) -> Made {
+        let fit = MadeGaussians { gaussians, losses, findings: Vec::new(), fingerprint: String::new() };
+        Made { fit, step: 0 }
+    }
+
     /// Returns the iterations whose losses were reported.
     pub(crate) fn step(&self) -> u32 {
         self.step

@@ -2,11 +2,13 @@
 //! filling.
 
 use crate::error::Result;
+use crate::gaussians::field::DeformableGaussians;
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gpu::device::Gpu;
-use crate::kernels::layout::GaussianSetup;
+use crate::kernels::layout::{Gaussian, GaussianSetup};
 use crate::methods::dynamic_gaussians::filling::{Filling, FillingBuffers};
 use crate::methods::dynamic_gaussians::stages::{OwnMotion, OwnMotionBuffers};
+use glam::DVec3;
 
 /// Gaussians with the optimiser's moments.
 #[derive(Debug, Clone)]
@@ -25,6 +27,25 @@ pub(super) struct MemberBuffers {
 }
 
 impl Members {
+    /// Returns no Gaussians, to which some can be appended.
+    pub(super) fn none(has_fillings: bool) -> Members {
+        let filling = has_fillings.then(|| Filling::fresh(Vec::new()));
+        Members { particles: Particles::fresh(Vec::new()), own: OwnMotion::fresh(Vec::new()), filling }
+    }
+
+    /// Appends Gaussians of the rest phase, each of which moves and is filled as its nearest neighbour in a deformable set.
+    pub(super) fn append(&mut self, rows: Vec<Gaussian>, deformable: &DeformableGaussians) {
+        let (n_basis, n_phases) = (deformable.setup.n_basis as usize, deformable.rest.n_phases);
+        for g in &rows {
+            let nearest = deformable.nearest(DVec3::from_array(g.position.map(f64::from)));
+            self.own.append(deformable.own[nearest * n_basis..][..n_basis].to_vec());
+            if let (Some(filling), Some(values)) = (&mut self.filling, &deformable.filling) {
+                filling.append(values[nearest * n_phases..][..n_phases].to_vec());
+            }
+        }
+        self.particles.append(rows);
+    }
+
     /// Keeps the Gaussians marked in `keep`, one mark per Gaussian.
     pub(super) fn retain(&mut self, keep: &[bool]) {
         self.particles.retain(keep);

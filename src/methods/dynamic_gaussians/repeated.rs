@@ -48,42 +48,49 @@ impl Targets {
     }
 }
 
-/// Fits of a run, one after the other. The last has the run's seed: its iterations are those of the run, and the earlier fits are its
-/// preparation.
+/// Fits of a run, one after the other. The first has the run's seed, and its iterations are those of the run. Where there are others, they
+/// take their motion from it, and its iterations are reported when they are done.
 pub(crate) struct Repeated {
     gpu: Gpu,
     /// Images of the fits that are left; none for a single fit.
     targets: Option<Targets>,
     config: Config,
     fits: u32,
-    /// Fields of the fits that are done.
-    done: Vec<DynamicGaussians>,
+    /// Fit that is under way: the run's, one of the others, or the run's again, to report its iterations.
+    fit: GaussianFit,
+    /// Losses of the run's fit while it is the first of several.
+    losses: Vec<f64>,
+    /// The run's fit while the others are made.
+    own: Option<Made>,
+    /// Fields of the other fits that are done.
+    others: Vec<DynamicGaussians>,
     /// Findings of these fits that were not taken yet.
     findings: Vec<String>,
-    /// Mean of these fields and of the fit that was made before, which is shown meanwhile.
+    /// Mean of the fields that are done, which is shown meanwhile.
     so_far: Option<DynamicGaussians>,
-    fit: GaussianFit,
-    /// Last fit, where it was made before.
-    made: Option<GaussianFit>,
     was_coarse: bool,
 }
 
 impl Repeated {
-    /// Begins the number of fits that configuration and data ask for. A fit that was made before is not repeated if it is the same.
+    /// Begins the number of fits that configuration and data ask for. A fit that was made before is not repeated if it is the run's.
     ///
     /// # Errors
     /// As [`GaussianFit::new`].
     pub(crate) fn new(gpu: &Gpu, targets: Targets, config: &Config, made: Option<&MadeGaussians>) -> Result<Repeated> {
-        let made = made.and_then(|made| Made::of(made, &targets, config)).map(|made| GaussianFit::Made(Box::new(made)));
-        match (targets.fits(config.gaussians.fits).0, made) {
-            (0 | 1, Some(made)) => Ok(Repeated::once(gpu, config, made)),
-            (0 | 1, None) => Ok(Repeated::once(gpu, config, GaussianFit::new(gpu, targets, config)?)),
-            (fits, made) => {
-                let fit = GaussianFit::new(gpu, targets.clone(), &seeded(config, fits - 1))?;
-                let so_far = made.as_ref().map(GaussianFit::field).transpose()?;
-                Ok(Repeated { fits, made, so_far, targets: Some(targets), ..Repeated::once(gpu, config, fit) })
-            }
+        let made = made.and_then(|made| Made::of(made, &targets, config));
+        let fits = targets.fits(config.gaussians.fits).0.max(1);
+        if fits == 1 {
+            let fit = match made {
+                Some(made) => GaussianFit::Made(Box::new(made)),
+                None => GaussianFit::new(gpu, targets, config)?,
+            };
+            return Ok(Repeated::once(gpu, config, fit));
         }
+        let fit = match made {
+            Some(made) => GaussianFit::Made(Box::new(made)),
+            None => GaussianFit::new(gpu, targets.clone(), config)?,
+        };
+        Ok(Repeated { fits, targets: Some(targets), ..Repeated::once(gpu, config, fit) })
     }
 
     /// Takes a single fit.
@@ -93,12 +100,13 @@ impl Repeated {
             targets: None,
             config: config.clone(),
             fits: 1,
-            done: Vec::new(),
+            losses: Vec::new(),
+            own: None,
+            others: Vec::new(),
             findings: Vec::new(),
             so_far: None,
             was_coarse: fit.is_coarse(),
             fit,
-            made: None,
         }
     }
 
@@ -107,8 +115,9 @@ impl Repeated {
         self.so_far.is_some() || self.fits == 1 && self.fit.is_presentable(end)
     }
 
+    /// Tells whether the iterations of the fit that is under way are reported as those of the run.
     fn is_last(&self) -> bool {
-        self.done.len() + 1 >= self.fits as usize
+        self.others.len() + 1 >= self.fits as usize
     }
 
     /// Tells whether the run's iterations use coarser images so far.
@@ -123,13 +132,17 @@ impl Repeated {
 
     /// Returns the share done of the preparation before the first iteration of the run; none when that has begun.
     pub(crate) fn preparation(&self) -> Option<f64> {
+        let iterated = f64::from(self.fit.step()) / f64::from(self.config.gaussian_iterations().max(1));
         let of_fit = match self.fit.preparation() {
             Some(share) if self.is_last() => share,
             None if self.is_last() => return None,
             Some(share) => 0.5 * share,
-            None => 0.5 + 0.5 * f64::from(self.fit.step()) / f64::from(self.config.gaussian_iterations().max(1)),
+            // The run's fit was prepared before; the others need no preparation.
+            None if self.own.is_none() => 0.5 + 0.5 * iterated,
+            None => iterated,
         };
-        Some((self.done.len() as f64 + of_fit) / f64::from(self.fits))
+        let done = self.others.len() + usize::from(self.own.is_some());
+        Some((done as f64 + of_fit) / f64::from(self.fits))
     }
 
     /// Runs some iterations towards `until`; returns the losses of those of the run.
@@ -141,22 +154,38 @@ impl Repeated {
             return self.fit.advance(until);
         }
         let end = self.config.gaussian_iterations();
-        self.fit.advance(end)?;
+        let losses = self.fit.advance(end)?;
+        if self.own.is_none() {
+            self.losses.extend(losses);
+        }
         if self.fit.step() >= end {
             let findings = self.findings_of_fit();
             self.findings.extend(findings);
-            self.done.push(self.fit.field()?);
-            self.so_far = Some(self.mean_with(self.made.as_ref())?);
-            let left = self.fits.saturating_sub(1 + self.done.len() as u32);
-            self.fit = match self.made.take_if(|_| left == 0) {
-                Some(made) => made,
-                None => {
-                    let targets = self.images(left)?;
-                    GaussianFit::new(&self.gpu, targets, &seeded(&self.config, left))?
-                }
-            };
+            self.fit = self.next()?;
         }
         Ok(Vec::new())
+    }
+
+    /// Keeps the fit that is done, and begins the next one.
+    fn next(&mut self) -> Result<GaussianFit> {
+        let field = self.fit.field()?;
+        let own = match self.own.take() {
+            Some(own) => {
+                self.others.push(field);
+                own
+            }
+            None => Made::done(field, std::mem::take(&mut self.losses)),
+        };
+        self.so_far = Some(self.mean_with(own.field())?);
+        if self.is_last() {
+            return Ok(GaussianFit::Made(Box::new(own)));
+        }
+        let number = self.others.len() as u32 + 1;
+        let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
+        let (targets, config) = (self.images(number)?, Config { seed, ..self.config.clone() });
+        let fit = GaussianFit::reseeded(&self.gpu, targets, &config, own.field())?;
+        self.own = Some(own);
+        Ok(fit)
     }
 
     /// Returns findings of all fits about the data since the last call, for the user.
@@ -165,35 +194,31 @@ impl Repeated {
         std::mem::take(&mut self.findings).into_iter().chain(last).collect()
     }
 
-    /// Takes the findings of the fit that is made now, which name it where there are several.
+    /// Takes the findings of the fit that is under way, which name it where there are several.
     fn findings_of_fit(&mut self) -> Vec<String> {
-        let (number, fits) = (self.done.len() + 1, self.fits);
+        let number = if self.own.is_some() { self.others.len() + 2 } else { 1 };
+        let fits = self.fits;
         let named = |finding| if fits > 1 { format!("fit {number} of {fits}: {finding}") } else { finding };
         self.fit.take_findings().into_iter().map(named).collect()
     }
 
-    /// Returns the images of a fit that is followed by so many others. The last fit takes them over.
-    fn images(&mut self, left: u32) -> Result<Targets> {
-        let images = if left == 0 { self.targets.take() } else { self.targets.clone() };
+    /// Returns the images of one of the other fits. The last one takes them over.
+    fn images(&mut self, number: u32) -> Result<Targets> {
+        let images = if number + 1 == self.fits { self.targets.take() } else { self.targets.clone() };
         images.ok_or_else(|| Error::Internal("there are no images for another fit".into()))
     }
 
     /// Returns the field: the mean of all fits that are done, or the field of the first fit.
     ///
     /// # Errors
-    /// As [`GaussianFit::field`]; [`Error::Internal`] where the fits have different forms.
+    /// As [`GaussianFit::field`].
     pub(crate) fn field(&self) -> Result<DynamicGaussians> {
-        let Some(so_far) = &self.so_far else { return self.fit.field() };
-        if !self.is_last() || self.fit.step() < self.config.gaussian_iterations() {
-            return Ok(so_far.clone());
-        }
-        self.mean_with(Some(&self.fit))
+        self.so_far.as_ref().map_or_else(|| self.fit.field(), |so_far| Ok(so_far.clone()))
     }
 
-    /// Returns the mean of the fits that are done and of another one.
-    fn mean_with(&self, other: Option<&GaussianFit>) -> Result<DynamicGaussians> {
-        let other = other.map(GaussianFit::field).transpose()?;
-        mean(&self.done.iter().cloned().chain(other).collect::<Vec<_>>())
+    /// Returns the mean of the run's field and those of the other fits that are done.
+    fn mean_with(&self, own: &DynamicGaussians) -> Result<DynamicGaussians> {
+        mean(&std::iter::once(own).chain(&self.others).cloned().collect::<Vec<_>>())
     }
 }
 
@@ -204,11 +229,6 @@ fn mean(fields: &[DynamicGaussians]) -> Result<DynamicGaussians> {
         fields => DynamicGaussians::mean(fields, MEAN_FACTOR),
     };
     mean.ok_or_else(|| Error::Internal("repeated fits to the same images have different forms".into()))
-}
-
-/// Returns the settings of a fit that is followed by so many others.
-fn seeded(config: &Config, left: u32) -> Config {
-    Config { seed: config.seed.wrapping_add(NEXT_SEED * left), ..config.clone() }
 }
 
 #[cfg(test)]

@@ -54,12 +54,13 @@ impl Draw<'_> {
 
 /// First Gaussians of every phase, of density 1; [`first_density`] tells the density they should have.
 pub fn seeds(targets: &Targets, settings: &sections::Gaussians, seed: u32) -> Vec<Gaussian> {
-    let mut all = Vec::new();
-    for phase in 0..targets.places.len() {
-        let draw = Draw { targets, settings, seed, round: phase as u32 };
-        all.extend(draw.gaussians(&likelihoods(targets, phase), settings.count as usize, phase, 1.0));
-    }
-    all
+    (0..targets.places.len()).flat_map(|phase| seeds_at(targets, settings, seed, phase)).collect()
+}
+
+/// First Gaussians of a phase; see [`seeds`].
+pub fn seeds_at(targets: &Targets, settings: &sections::Gaussians, seed: u32, phase: usize) -> Vec<Gaussian> {
+    let draw = Draw { targets, settings, seed, round: phase as u32 };
+    draw.gaussians(&likelihoods(targets, phase), settings.count as usize, phase, 1.0).collect()
 }
 
 /// Density of the first Gaussians, from what they show with a density of 1: `images`, `[image][pixel]`.
