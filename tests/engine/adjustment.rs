@@ -271,7 +271,7 @@ fn a_session_adjusts_its_views_when_training_has_ended_and_trains_on() {
     let mut shot = Studio::new(&gpu, 100, 1).shoot(3, false, wrong);
     // Contrasts that differ from frame to frame: calibration does not know them.
     for frame in &mut shot.dataset.frames {
-        let contrast = if (frame.phase as usize + frame.view).is_multiple_of(2) { 1.08 } else { 0.92 };
+        let contrast = if (frame.phase as usize + frame.view).is_multiple_of(2) { 1.15 } else { 0.85 };
         frame.integrals = frame.integrals.iter().map(|integral| contrast * integral).collect::<Vec<_>>().into();
     }
     let session = session(&gpu, &shot);
