@@ -343,7 +343,7 @@ impl DeformableTrainer {
         let clear = setup::clears(settings, self.step);
         let stop = setup::next_stop(settings, self.step, until);
         if renew {
-            self.renew_background()?;
+            self.renew_background(self.renewal())?;
         }
         if grow {
             self.grow()?;
@@ -367,8 +367,8 @@ impl DeformableTrainer {
     }
 
     /// Estimates the static background anew from what the Gaussians leave of the images, and with it the bounds of the fit's targets.
-    pub(super) fn renew_background(&mut self) -> Result<()> {
-        let (images, renewal) = (self.images()?, self.renewal());
+    pub(super) fn renew_background(&mut self, renewal: Renewal) -> Result<()> {
+        let images = self.images()?;
         renew_bounds(&self.gpu, &mut self.targets, &self.joint.parts, &self.joint.setup, &images, renewal)
     }
 

@@ -52,7 +52,7 @@ impl Targets {
 /// take their motion from it, and its iterations are reported when they are done.
 pub(crate) struct Repeated {
     gpu: Gpu,
-    /// Images of the fits that are left; none for a single fit.
+    /// Images of the other fits that are left; none for a single fit.
     targets: Option<Targets>,
     config: Config,
     fits: u32,
@@ -79,18 +79,12 @@ impl Repeated {
     pub(crate) fn new(gpu: &Gpu, targets: Targets, config: &Config, made: Option<&MadeGaussians>) -> Result<Repeated> {
         let made = made.and_then(|made| Made::of(made, &targets, config));
         let fits = targets.fits(config.gaussians.fits).0.max(1);
-        if fits == 1 {
-            let fit = match made {
-                Some(made) => GaussianFit::Made(Box::new(made)),
-                None => GaussianFit::new(gpu, targets, config)?,
-            };
-            return Ok(Repeated::once(gpu, config, fit));
-        }
+        let for_others = (fits > 1).then(|| targets.clone());
         let fit = match made {
             Some(made) => GaussianFit::Made(Box::new(made)),
-            None => GaussianFit::new(gpu, targets.clone(), config)?,
+            None => GaussianFit::new(gpu, targets, config)?,
         };
-        Ok(Repeated { fits, targets: Some(targets), ..Repeated::once(gpu, config, fit) })
+        Ok(Repeated { fits, targets: for_others, ..Repeated::once(gpu, config, fit) })
     }
 
     /// Takes a single fit.

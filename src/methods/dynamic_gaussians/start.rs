@@ -11,6 +11,7 @@ use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Fit};
 use crate::methods::dynamic_gaussians::per_phase::{GaussianTrainer, strong};
 use crate::methods::dynamic_gaussians::seeds;
 use crate::methods::dynamic_gaussians::stages::Track;
+use crate::methods::dynamic_gaussians::target_buffers::Renewal;
 use crate::methods::dynamic_gaussians::targets::Targets;
 use std::ops::Range;
 
@@ -209,7 +210,8 @@ impl DeformableTrainer {
     ) -> Result<DeformableTrainer> {
         let mut trainer = DeformableTrainer::going_on(gpu, targets, config, earlier, 0)?;
         if config.gaussians.background_every > 0 {
-            trainer.renew_background()?;
+            // The seeds need the bounds on the host.
+            trainer.renew_background(Renewal::OneOfSeveral)?;
         }
         let (targets, moving) = (trainer.targets(), trainer.deformable()?);
         let settings = targets.lengths.gaussians(&config.gaussians);
