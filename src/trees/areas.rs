@@ -30,8 +30,10 @@ const FROM_FIELD: f64 = 1.0;
 /// which it grows: the field shows wide vessels well, and the middle of their shadows is never uncovered.
 const WIDE_CERTAINTY: f64 = 30.0;
 const WIDE_POWER: i32 = 12;
-/// Standard deviation of the difference of two successive radii, as a share of the typical radius.
-const STEP_CHANGE: f64 = 0.25;
+/// Standard deviation of the difference of two successive radii, as a share of the typical radius, where pixels are as wide as the field's
+/// resolution, and where they are half as wide or narrower. Errors of shadows in wide pixels look like changes of the radius.
+const STEP_CHANGE_IN_WIDE_PIXELS: f64 = 0.25;
+const STEP_CHANGE: f64 = 0.35;
 /// Minimum radius, as a share of the typical one, for which differences of radii are expressed by those of areas.
 const MIN_SHARE: f64 = 0.3;
 /// Number of points on each side over which the typical area is a median, and then a mean.
@@ -72,7 +74,9 @@ pub fn measure_radii(beat: &mut BeatTree, dataset: &Dataset) -> Result<(), &'sta
     if views.len() < MIN_VIEWS {
         return Err("fewer than two training views show three phases of the tree");
     }
-    let expected = Expected::new(&field, &lengths, beat.resolution_mm);
+    let pixel_mm = views.iter().map(|view| view.pixel_mm).fold(0.0, f64::max);
+    let step_change = step_change(pixel_mm / beat.resolution_mm);
+    let expected = Expected { step_change, ..Expected::new(&field, &lengths, beat.resolution_mm) };
     let (mut areas, mut slides) = (field.clone(), Slides::none(&beat.phases));
     for round in 0..ROUNDS + SLIDING_ROUNDS {
         if round >= ROUNDS {
@@ -97,6 +101,13 @@ pub fn measure_radii(beat: &mut BeatTree, dataset: &Dataset) -> Result<(), &'sta
     Ok(())
 }
 
+/// Returns the standard deviation of the difference of two successive radii, as a share of the typical one, for pixels of a width in units of the
+/// field's resolution.
+fn step_change(pixel: f64) -> f64 {
+    let narrow = (2.0 * (1.0 - pixel)).clamp(0.0, 1.0);
+    STEP_CHANGE_IN_WIDE_PIXELS + narrow * (STEP_CHANGE - STEP_CHANGE_IN_WIDE_PIXELS)
+}
+
 /// Areas that are expected before the images are compared, and how certain they are.
 struct Expected<'a> {
     /// Areas of the field, mm^2.
@@ -107,12 +118,20 @@ struct Expected<'a> {
     typical: Vec<f64>,
     /// Whether a point is followed by another one of its branch.
     goes_on: Vec<bool>,
+    /// Standard deviation of the difference of two successive radii, as a share of the typical radius.
+    step_change: f64,
 }
 
 impl Expected<'_> {
     /// Returns the expectation for branches of numbers of points, from a field of a resolution.
     fn new<'a>(field: &'a [f64], lengths: &[usize], resolution_mm: f64) -> Expected<'a> {
-        let mut expected = Expected { field, certainty: Vec::new(), typical: Vec::new(), goes_on: Vec::new() };
+        let mut expected = Expected {
+            field,
+            certainty: Vec::new(),
+            typical: Vec::new(),
+            goes_on: Vec::new(),
+            step_change: STEP_CHANGE,
+        };
         let mut rest = field;
         for n in lengths {
             let (own, others) = rest.split_at(*n);
@@ -140,7 +159,7 @@ impl Expected<'_> {
             let typical = 0.5 * (self.typical[i] + self.typical[i + 1]);
             let share = (0.5 * (areas[i] + areas[i + 1]) / typical).max(MIN_SHARE.powi(2));
             // The area is pi r^2, and its difference 2 pi r times that of the radius.
-            (2.0 * STEP_CHANGE * typical).powi(-2) / share
+            (2.0 * self.step_change * typical).powi(-2) / share
         };
         (0..areas.len()).map(step).collect()
     }

@@ -15,7 +15,7 @@ use crate::trees::radii::Lumen;
 use crate::trees::refine::{Centring, STEP, evenly, from_voxels};
 use crate::trees::sampled::SampledField;
 use crate::trees::solid::make_solid;
-use crate::trees::tidy::{bridge_gaps, drop_specks, prune_spurs};
+use crate::trees::tidy::{bridge_gaps, bridge_stenoses, drop_specks, prune_spurs};
 use crate::trees::tree::{BeatTree, Branch, PhaseTree, RadiiFrom};
 use crate::vessels::centreline::centreline;
 use crate::vessels::distances::DistanceMap;
@@ -259,6 +259,7 @@ fn centrelines(field: &SampledField, vessels: &Mask, resolution_mm: f64, least_b
     let mut forest = thinned(field, vessels);
     bridge_gaps(&mut forest, resolution_mm);
     prune_spurs(&mut forest, least_branch_mm);
+    bridge_stenoses(&mut forest, resolution_mm);
     drop_specks(&mut forest, least_branch_mm);
     let centring = Centring { field, resolution_mm };
     let mut lines: Vec<Line> = Vec::new();
@@ -397,7 +398,14 @@ mod tests {
     fn a_gap_is_closed_and_nothing_has_no_lines() {
         let part = |from: f64, to: f64| (points(200, |along| DVec3::Z * (from + (to - from) * along)), 1.0);
         assert_eq!(found(&[part(-17.0, -1.5), part(1.5, 17.0)]).len(), 1);
-        assert_eq!(found(&[part(-17.0, -5.0), part(5.0, 17.0)]).len(), 2);
+        // A severe stenosis, which the line crosses at even steps.
+        let lines = found(&[part(-17.0, -5.0), part(5.0, 17.0)]);
+        assert_eq!(lines.len(), 1);
+        let points_mm = &lines[0].points_mm;
+        let steps_mm = points_mm.windows(2).map(|pair| pair[0].distance(pair[1]));
+        assert!(steps_mm.fold(0.0, f64::max) < RESOLUTION_MM, "{points_mm:?}");
+        assert!(points_mm.iter().all(|p| p.truncate().length() < 0.1), "{points_mm:?}");
+        assert_eq!(found(&[part(-17.0, -8.0), part(8.0, 17.0)]).len(), 2);
         assert!(found(&[]).is_empty());
     }
 }

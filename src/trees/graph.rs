@@ -121,7 +121,12 @@ impl Forest {
 
     /// Nodes at the ends of lines.
     pub(super) fn ends(&self) -> impl Iterator<Item = usize> {
-        (0..self.nodes.len()).filter(|node| self.nodes[*node].links.len() == 1)
+        (0..self.nodes.len()).filter(|node| self.is_end(*node))
+    }
+
+    /// Tells whether a node is an end.
+    pub(super) fn is_end(&self, node: usize) -> bool {
+        self.nodes[node].links.len() == 1
     }
 
     /// Positions of nodes, mm.

@@ -26,7 +26,7 @@ const FARTHEST_RIDGE_PX: f64 = 1.6;
 const RIDGE_POINTS: usize = 4;
 const MIN_RIDGES: usize = 4;
 /// Share of the changes of a pixel from phase to phase that is an error of the shadows there.
-const OF_CHANGES: f64 = 0.4;
+const OF_CHANGES: f64 = 0.3;
 /// Radius of the median filter of the changes from phase to phase, pixels.
 const STEADY_PX: usize = 2;
 /// Minimum number of phases that a view must show: its static background is found from their differences.
@@ -46,6 +46,8 @@ pub(super) struct ShadowedFrame {
 pub(super) struct ShadowedView {
     /// The images.
     pub frames: Vec<ShadowedFrame>,
+    /// Width of a pixel at the isocentre, mm.
+    pub pixel_mm: f64,
     /// Variance of each pixel of the blurred images: of its noise, and of a share of its changes from phase to phase.
     variance: Vec<f64>,
     /// Whether each pixel shows the patient.
@@ -83,7 +85,12 @@ impl ShadowedView {
             .collect();
         let on_canvas = |p: usize| p / size[0] * dataset.width + p % size[0];
         let shown = (0..size[0] * size[1]).map(|p| dataset.shows(view, on_canvas(p))).collect();
-        Some(ShadowedView { frames, variance, shown })
+        Some(ShadowedView {
+            frames,
+            pixel_mm: pixel_mm2(&dataset.views[view].rays, DVec3::ZERO).sqrt(),
+            variance,
+            shown,
+        })
     }
 
     fn n_pixels(&self) -> usize {
@@ -157,6 +164,14 @@ fn unsteadiness(frames: &[ShadowedFrame], [width, height]: [usize; 2]) -> impl I
     median_filter(&Image { width, height, values }, STEADY_PX).values.into_iter().map(f64::from)
 }
 
+/// Returns the area of a pixel at a point, perpendicular to the ray, mm^2.
+fn pixel_mm2(rays: &ViewRays, point_mm: DVec3) -> f64 {
+    let away = world_from_lps_mm(point_mm) - rays.source();
+    let depth_mm = away.dot(rays.axis()).abs() * MM_PER_UNIT;
+    let obliquity = away.normalize_or(rays.axis()).dot(rays.axis()).abs();
+    rays.direction[1].cross(rays.direction[2]).length() * depth_mm.powi(2) * obliquity
+}
+
 /// An image of a view and how the tree is projected into it.
 struct Projection<'a> {
     /// Rays that see the heart.
@@ -190,7 +205,7 @@ impl Projection<'_> {
         let moved = self.moved_to_ridges(branch);
         let shadow = |i: usize| {
             let centre = moved[i]?;
-            let pixel_mm2 = self.pixel_mm2(points[i]);
+            let pixel_mm2 = pixel_mm2(&self.rays, points[i]);
             let radius_px = branch.radius_mm[i] / pixel_mm2.sqrt();
             Some(PointShadow {
                 point: start + i,
@@ -201,14 +216,6 @@ impl Projection<'_> {
             })
         };
         (0..points.len()).filter_map(shadow).collect()
-    }
-
-    /// Returns the area of a pixel at a point, perpendicular to the ray, mm^2.
-    fn pixel_mm2(&self, point_mm: DVec3) -> f64 {
-        let away = world_from_lps_mm(point_mm) - self.rays.source();
-        let depth_mm = away.dot(self.rays.axis()).abs() * MM_PER_UNIT;
-        let obliquity = away.normalize_or(self.rays.axis()).dot(self.rays.axis()).abs();
-        self.rays.direction[1].cross(self.rays.direction[2]).length() * depth_mm.powi(2) * obliquity
     }
 
     fn projected(&self, point_mm: DVec3) -> Option<DVec2> {

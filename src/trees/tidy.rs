@@ -9,6 +9,11 @@ const DIRECTION: f64 = 3.0;
 const GAP: f64 = 5.0;
 /// Maximum angle between an end's direction and its bridge.
 const GAP_DEG: f64 = 45.0;
+/// Maximum width of the gap between two ends that face each other, in units of the field's resolution. Of 13 such gaps in trees with and without
+/// stenoses, 12 were gaps of one vessel, but only 1 of 8 as wide between an end and the side of a vessel.
+const STENOSIS: f64 = 10.0;
+/// Minimum length of a line whose end faces another, in units of the field's resolution: shorter ones have no direction.
+const STUB: f64 = 2.0;
 /// Maximum length of a speck, as a share of the longest tree's length.
 const SPECK: f64 = 0.05;
 
@@ -31,12 +36,17 @@ fn direction(forest: &Forest, end: usize, along_mm: f64) -> Option<DVec3> {
 /// Links ends of trees with a node of another tree ahead of them, the narrowest gap first, each end once. Two lines that
 /// end in one place are linked whatever their direction.
 pub(super) fn bridge_gaps(forest: &mut Forest, resolution_mm: f64) {
-    let mut bridges: Vec<Bridge> = forest.ends().flat_map(|end| bridges_from(forest, end, resolution_mm)).collect();
+    let bridges = forest.ends().flat_map(|end| bridges_from(forest, end, resolution_mm)).collect();
+    link_narrowest_first(forest, bridges, |forest, bridge| forest.is_end(bridge.end));
+}
+
+/// Links trees across gaps, the narrowest first, where that is still possible; no cycle is made.
+fn link_narrowest_first(forest: &mut Forest, mut bridges: Vec<Bridge>, is_open: impl Fn(&Forest, &Bridge) -> bool) {
     bridges.sort_by(|a, b| a.width_mm.total_cmp(&b.width_mm));
     let mut trees = forest.trees();
-    for Bridge { end, node, .. } in bridges {
-        if forest.nodes[end].links.len() == 1 && trees.join(end, node) {
-            forest.link(end, node);
+    for bridge in bridges {
+        if is_open(forest, &bridge) && trees.join(bridge.end, bridge.node) {
+            forest.link(bridge.end, bridge.node);
         }
     }
 }
@@ -53,6 +63,29 @@ fn bridges_from(forest: &Forest, end: usize, resolution_mm: f64) -> Vec<Bridge> 
         (narrow && is_ahead && !forest.nodes[node].links.is_empty()).then_some(Bridge { end, node, width_mm })
     };
     (0..forest.nodes.len()).filter_map(bridge).collect()
+}
+
+/// Links ends of two trees that face each other across a wider gap: a field may show nothing of a vessel in a severe stenosis, while the vessel
+/// behind it is there.
+pub(super) fn bridge_stenoses(forest: &mut Forest, resolution_mm: f64) {
+    let long_enough = |end: &usize| {
+        let chain = forest.nodes[*end].links.first().map(|link| forest.chain(*end, *link));
+        chain.is_some_and(|chain| forest.length_mm(&chain) >= STUB * resolution_mm)
+    };
+    let with_direction = |end| Some((end, direction(forest, end, DIRECTION * resolution_mm)?));
+    let ends: Vec<(usize, DVec3)> = forest.ends().filter(long_enough).filter_map(with_direction).collect();
+    let mut bridges = Vec::new();
+    for (i, (end, ahead)) in ends.iter().enumerate() {
+        for (node, back) in &ends[i + 1..] {
+            let to = forest.nodes[*node].place_mm - forest.nodes[*end].place_mm;
+            let width_mm = to.length();
+            let faces = |ahead: &DVec3, to: DVec3| ahead.angle_between(to).to_degrees() <= GAP_DEG;
+            if width_mm <= STENOSIS * resolution_mm && faces(ahead, to) && faces(back, -to) {
+                bridges.push(Bridge { end: *end, node: *node, width_mm });
+            }
+        }
+    }
+    link_narrowest_first(forest, bridges, |forest, bridge| forest.is_end(bridge.end) && forest.is_end(bridge.node));
 }
 
 /// Share of the radius of a vessel that a branch must reach beyond its lumen: a bump of a thick vessel is no branch.
@@ -136,6 +169,24 @@ mod tests {
         ] {
             let mut forest = forest(&[line, other]);
             bridge_gaps(&mut forest, 1.0);
+            assert_eq!(n_trees(&forest), trees, "{why}");
+        }
+    }
+
+    #[test]
+    fn a_tree_behind_a_stenosis_is_linked_and_one_that_turns_away_is_not() {
+        let line = (DVec3::ZERO, DVec3::X * 20.0);
+        for (other, trees, why) in [
+            ((DVec3::new(29.0, 1.0, 0.0), DVec3::new(40.0, 6.0, 0.0)), 1, "a vessel that goes on"),
+            ((DVec3::X * 31.0, DVec3::X * 40.0), 2, "one that is too far away"),
+            ((DVec3::new(29.0, 1.0, 0.0), DVec3::new(25.0, 12.0, 0.0)), 2, "an end that points elsewhere"),
+            ((DVec3::new(27.0, -9.0, 0.0), DVec3::new(27.0, 9.0, 0.0)), 2, "the side of a vessel"),
+            ((DVec3::X * 28.0, DVec3::X * 29.0), 2, "a stub"),
+        ] {
+            let mut forest = forest(&[line, other]);
+            bridge_gaps(&mut forest, 1.0);
+            assert_eq!(n_trees(&forest), 2, "{why}: the gap is wider than those that fields have elsewhere");
+            bridge_stenoses(&mut forest, 1.0);
             assert_eq!(n_trees(&forest), trees, "{why}");
         }
     }
