@@ -97,6 +97,7 @@ mod tests {
             radius_mm: (0..141).map(|i| 1.5 * factor(f64::from(i)).product::<f64>()).collect(),
             agreement: Vec::new(),
             doubt: Vec::new(),
+            gap_mm: 0.0,
         };
         PhaseTree { phase: 2, branches: vec![branch] }
     }

@@ -335,6 +335,7 @@ mod tests {
             radius_mm: vec![1.0; 3],
             agreement: Vec::new(),
             doubt: Vec::new(),
+            gap_mm: 0.0,
         };
         let phases = (0..4).map(|phase| PhaseTree { phase, branches: vec![branch(phase)] }).collect();
         BeatTree {

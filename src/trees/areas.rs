@@ -332,6 +332,7 @@ mod tests {
                 radius_mm: vec![0.85; 60],
                 agreement: Vec::new(),
                 doubt: Vec::new(),
+                gap_mm: 0.0,
             }
         };
         BeatTree {

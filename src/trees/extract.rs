@@ -239,10 +239,10 @@ impl Finder<'_> {
     /// Measures the radii of the vessels along lines at a phase, and how far repeated fits agree on them.
     fn measured(&self, field: &SampledField, lines: Vec<Line>, phase: u32) -> Vec<Branch> {
         let lumen = self.lumen(field);
-        let branch = |Line { parent, points_mm }: Line| {
+        let branch = |Line { parent, points_mm, gap_mm }: Line| {
             let radius_mm = lumen.radii_mm(&points_mm);
             let agreement = self.agreement(&points_mm, phase);
-            Branch { parent, points_mm, radius_mm, agreement, doubt: Vec::new() }
+            Branch { parent, points_mm, radius_mm, gap_mm, agreement, doubt: Vec::new() }
         };
         lines.into_iter().map(branch).collect()
     }
@@ -252,6 +252,8 @@ impl Finder<'_> {
 struct Line {
     parent: Option<usize>,
     points_mm: Vec<DVec3>,
+    /// Length of the gaps that were bridged, mm.
+    gap_mm: f64,
 }
 
 /// Centrelines of the vessels of a field, each after its parent.
@@ -265,13 +267,16 @@ fn centrelines(field: &SampledField, vessels: &Mask, resolution_mm: f64, least_b
     let mut lines: Vec<Line> = Vec::new();
     for chain in chains(&forest) {
         let mut points_mm = forest.places_mm(&chain.nodes);
+        // Links of voxels that touch are shorter than the resolution.
+        let links_mm = points_mm.windows(2).map(|pair| pair[0].distance(pair[1]));
+        let gap_mm = links_mm.filter(|link| *link > resolution_mm).sum();
         let start = chain.parent.and_then(|parent| lines[parent].points_mm.last().copied());
         points_mm[0] = start.unwrap_or(points_mm[0]);
         let mut points_mm = from_voxels(&points_mm, resolution_mm);
         for _ in 0..CENTRINGS {
             points_mm = evenly(&centring.line(&points_mm, start.is_some()), STEP * resolution_mm);
         }
-        lines.push(Line { parent: chain.parent, points_mm });
+        lines.push(Line { parent: chain.parent, points_mm, gap_mm });
     }
     lines
 }
@@ -401,11 +406,13 @@ mod tests {
         // A severe stenosis, which the line crosses at even steps.
         let lines = found(&[part(-17.0, -5.0), part(5.0, 17.0)]);
         assert_eq!(lines.len(), 1);
+        assert!((lines[0].gap_mm - 10.0).abs() < 2.0, "{} mm", lines[0].gap_mm);
         let points_mm = &lines[0].points_mm;
         let steps_mm = points_mm.windows(2).map(|pair| pair[0].distance(pair[1]));
         assert!(steps_mm.fold(0.0, f64::max) < RESOLUTION_MM, "{points_mm:?}");
         assert!(points_mm.iter().all(|p| p.truncate().length() < 0.1), "{points_mm:?}");
-        assert_eq!(found(&[part(-17.0, -8.0), part(8.0, 17.0)]).len(), 2);
+        let lines = found(&[part(-17.0, -8.0), part(8.0, 17.0)]);
+        assert_eq!(lines.iter().map(|line| line.gap_mm).collect::<Vec<_>>(), [0.0, 0.0]);
         assert!(found(&[]).is_empty());
     }
 }

@@ -126,6 +126,8 @@ struct BranchRow {
     length_mm: f64,
     points_mm: Vec<[f64; 3]>,
     radius_mm: Vec<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    gap_mm: Option<f64>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     agreement: Vec<f64>,
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
@@ -170,6 +172,7 @@ impl BranchRow {
             length_mm: rounded(branch.length_mm()),
             points_mm: branch.points_mm.iter().map(rounded_point).collect(),
             radius_mm: branch.radius_mm.iter().copied().map(rounded).collect(),
+            gap_mm: (branch.gap_mm > 0.0).then(|| rounded(branch.gap_mm)),
             agreement: branch.agreement.iter().copied().map(rounded).collect(),
             doubt: DoubtRows::of(branch),
         }
@@ -359,6 +362,7 @@ mod tests {
                 radius_mm: vec![2.0, 1.5],
                 agreement: Vec::new(),
                 doubt: Vec::new(),
+                gap_mm: 0.0,
             },
             Branch {
                 parent: Some(0),
@@ -366,6 +370,7 @@ mod tests {
                 radius_mm: vec![1.5, 1.0, 0.5],
                 agreement: Vec::new(),
                 doubt: Vec::new(),
+                gap_mm: 0.0,
             },
             Branch {
                 parent: Some(0),
@@ -373,6 +378,7 @@ mod tests {
                 radius_mm: vec![1.5, 0.7],
                 agreement: Vec::new(),
                 doubt: Vec::new(),
+                gap_mm: 0.0,
             },
         ];
         let phases = vec![PhaseTree { phase: 3, branches }];
@@ -407,6 +413,16 @@ mod tests {
                 assert_eq!(text.matches(said).count(), 1, "{text}");
             }
         }
+    }
+
+    #[test]
+    fn json_states_gaps_where_there_are_any() {
+        let mut beat = beat(None);
+        assert!(!to_json(&beat).unwrap().contains("gap_mm"));
+        beat.phases[0].branches[1].gap_mm = 8.25;
+        let json: serde_json::Value = serde_json::from_str(&to_json(&beat).unwrap()).unwrap();
+        let gaps = [0, 1, 2].map(|branch| json["phases"][0]["branches"][branch]["gap_mm"].as_f64());
+        assert_eq!(gaps, [None, Some(8.25), None]);
     }
 
     #[test]

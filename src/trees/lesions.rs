@@ -321,6 +321,7 @@ mod tests {
             radius_mm: (0..n).map(|i| radius(at(i))).collect(),
             agreement: Vec::new(),
             doubt: Vec::new(),
+            gap_mm: 0.0,
         }
     }
 

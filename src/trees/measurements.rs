@@ -261,6 +261,7 @@ mod tests {
             doubt: vec![doubt; radius_mm.len()],
             radius_mm,
             agreement: Vec::new(),
+            gap_mm: 0.0,
         };
         let phases = [0, 5].map(|phase| PhaseTree { phase, branches: vec![branch.clone()] }).to_vec();
         BeatTree {

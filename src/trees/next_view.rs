@@ -271,6 +271,7 @@ mod tests {
             radius_mm: vec![1.5; 21],
             agreement: vec![agreement; 21],
             doubt: Vec::new(),
+            gap_mm: 0.0,
         }
     }
 

@@ -148,6 +148,7 @@ mod tests {
             radius_mm: vec![1.0; 41],
             agreement: Vec::new(),
             doubt: Vec::new(),
+            gap_mm: 0.0,
         }
     }
 

@@ -162,6 +162,7 @@ mod tests {
             radius_mm: vec![1.0; n],
             agreement: Vec::new(),
             doubt: Vec::new(),
+            gap_mm: 0.0,
         };
         let phase = |phase: u32| PhaseTree { phase, branches: vec![branch(4), branch(1)] };
         let mut slides = Slides::none(&[phase(0), phase(1)]);

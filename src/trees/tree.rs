@@ -38,6 +38,9 @@ pub struct Branch {
     pub points_mm: Vec<DVec3>,
     /// Radius of the lumen at each point, mm.
     pub radius_mm: Vec<f64>,
+    /// Length of the parts where the field is below the threshold, mm: gaps across which two centrelines were linked because one points at the
+    /// other; 0 for none.
+    pub gap_mm: f64,
     /// Share of the other fits that have a vessel at each point, 0 to 1, where the field is the mean of several fits: points with little
     /// agreement may be false crossings. Empty for a single fit.
     pub agreement: Vec<f64>,
@@ -217,6 +220,7 @@ mod tests {
             radius_mm: vec![1.0; 4],
             agreement: agreement.to_vec(),
             doubt: Vec::new(),
+            gap_mm: 0.0,
         };
         let tree = |branches: Vec<Branch>| PhaseTree { phase: 0, branches };
         let doubt = tree(vec![line(&[1.0, 1.0, 0.4, 0.0]), line(&[1.0; 4])]);

@@ -141,6 +141,7 @@ mod tests {
             radius_mm: (0..=40).map(|i| 2.0 - 0.02 * f64::from(i)).collect(),
             agreement: Vec::new(),
             doubt: Vec::new(),
+            gap_mm: 0.0,
         }
     }
 

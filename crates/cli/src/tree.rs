@@ -327,6 +327,13 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     let measured = MeasuredBeat::new(&beat);
     let with_lesions = if beat.reference_phase.is_some() { 1 } else { beat.phases.len() };
     for tree in beat.phases.iter().take(with_lesions) {
+        for (index, branch) in tree.branches.iter().enumerate().filter(|(_, branch)| branch.gap_mm > 0.0) {
+            eprintln!(
+                "phase {}: branch {index} has a gap of {:.1} mm: the field is below the threshold there, as in a severe stenosis, and two \
+                 vessels are linked because one points at the other",
+                tree.phase, branch.gap_mm
+            );
+        }
         for lesion in lesions(tree, beat.measurement()) {
             eprintln!("phase {}: {}", tree.phase, in_words(&lesion, &measured.percents(&lesion)));
         }
