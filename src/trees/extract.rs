@@ -267,9 +267,10 @@ fn centrelines(field: &SampledField, vessels: &Mask, resolution_mm: f64, least_b
     let mut lines: Vec<Line> = Vec::new();
     for chain in chains(&forest) {
         let mut points_mm = forest.places_mm(&chain.nodes);
-        // Links of voxels that touch are shorter than the resolution.
+        // Voxels that touch are less than two steps of the grid apart.
+        let touching_mm = 2.0 * field.grid.spacing_mm.max_element();
         let links_mm = points_mm.windows(2).map(|pair| pair[0].distance(pair[1]));
-        let gap_mm = links_mm.filter(|link| *link > resolution_mm).sum();
+        let gap_mm = links_mm.filter(|link_mm| *link_mm > touching_mm).sum();
         let start = chain.parent.and_then(|parent| lines[parent].points_mm.last().copied());
         points_mm[0] = start.unwrap_or(points_mm[0]);
         let mut points_mm = from_voxels(&points_mm, resolution_mm);

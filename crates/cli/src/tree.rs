@@ -329,8 +329,8 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     for tree in beat.phases.iter().take(with_lesions) {
         for (index, branch) in tree.branches.iter().enumerate().filter(|(_, branch)| branch.gap_mm > 0.0) {
             eprintln!(
-                "phase {}: branch {index} has a gap of {:.1} mm: the field is below the threshold there, as in a severe stenosis, and two \
-                 vessels are linked because one points at the other",
+                "phase {}: branch {index} has a gap of {:.1} mm: the field is below the threshold there, and two vessels are linked because one \
+                 points at the other",
                 tree.phase, branch.gap_mm
             );
         }
