@@ -75,8 +75,7 @@ pub fn measure_radii(beat: &mut BeatTree, dataset: &Dataset) -> Result<(), &'sta
         return Err("fewer than two training views show three phases of the tree");
     }
     let pixel_mm = views.iter().map(|view| view.pixel_mm).fold(0.0, f64::max);
-    let step_change = step_change(pixel_mm / beat.resolution_mm);
-    let expected = Expected { step_change, ..Expected::new(&field, &lengths, beat.resolution_mm) };
+    let expected = Expected::new(&field, &lengths, beat.resolution_mm, pixel_mm);
     let (mut areas, mut slides) = (field.clone(), Slides::none(&beat.phases));
     for round in 0..ROUNDS + SLIDING_ROUNDS {
         if round >= ROUNDS {
@@ -123,14 +122,14 @@ struct Expected<'a> {
 }
 
 impl Expected<'_> {
-    /// Returns the expectation for branches of numbers of points, from a field of a resolution.
-    fn new<'a>(field: &'a [f64], lengths: &[usize], resolution_mm: f64) -> Expected<'a> {
+    /// Returns the expectation for branches of numbers of points, from a field of a resolution and images with pixels of a width at the isocentre.
+    fn new<'a>(field: &'a [f64], lengths: &[usize], resolution_mm: f64, pixel_mm: f64) -> Expected<'a> {
         let mut expected = Expected {
             field,
             certainty: Vec::new(),
             typical: Vec::new(),
             goes_on: Vec::new(),
-            step_change: STEP_CHANGE,
+            step_change: step_change(pixel_mm / resolution_mm),
         };
         let mut rest = field;
         for n in lengths {
@@ -345,6 +344,13 @@ mod tests {
             views: Vec::new(),
             phases: (0..PHASES).map(|phase| PhaseTree { phase, branches: vec![branch(phase)] }).collect(),
             measured_mm: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn radii_change_more_freely_in_narrow_pixels() {
+        for (pixel, expected) in [(0.2, STEP_CHANGE), (0.5, STEP_CHANGE), (0.75, 0.3), (1.0, 0.25), (1.3, 0.25)] {
+            assert!((step_change(pixel) - expected).abs() < 1e-12, "{pixel}: {}", step_change(pixel));
         }
     }
 
