@@ -246,6 +246,7 @@ pub mod vessels {
 /// Vessels as trees of centrelines with radii, followed over the beat.
 pub mod trees {
     pub mod areas;
+    mod blur;
     mod branches;
     pub mod doubt;
     pub mod extract;

@@ -3,16 +3,18 @@
 //! A field of limited resolution shows thin vessels and short stenoses blurred. Images show them blurred as well, but the sum of line
 //! integrals across the shadow of a vessel stays in proportion to its area, however thin it is. The areas of all points of a tree are
 //! found together by least squares: the shadows of the centrelines are added to the static background of each view, so that vessels that lie
-//! over each other in a view share its pixels. Errors of the places of points along their vessels are found beside the areas.
+//! over each other in a view share its pixels. Errors of the places of points along their vessels are found beside the areas; the blur along
+//! vessels that the rest of them causes is taken out at the end.
 
 use crate::calibrate::observed::binned_to;
 use crate::evidence::series::Series;
 use crate::linear::conjugate_gradients;
 use crate::raster::percentile;
 use crate::scan::dataset::Dataset;
+use crate::trees::blur::without_blur;
 use crate::trees::shadowed::ShadowedView;
 use crate::trees::slides::Slides;
-use crate::trees::tree::{BeatTree, RadiiFrom};
+use crate::trees::tree::{BeatTree, PhaseTree, RadiiFrom};
 use std::f64::consts::PI;
 
 /// Minimum smaller side, pixels, of the binned images in which areas are measured.
@@ -31,9 +33,16 @@ const FROM_FIELD: f64 = 1.0;
 const WIDE_CERTAINTY: f64 = 30.0;
 const WIDE_POWER: i32 = 12;
 /// Standard deviation of the difference of two successive radii, as a share of the typical radius, where pixels are as wide as the field's
-/// resolution, and where they are half as wide or narrower. Errors of shadows in wide pixels look like changes of the radius.
+/// resolution, and where they are half as wide or narrower ([`narrow`]). Errors of shadows in wide pixels look like changes of the radius.
 const STEP_CHANGE_IN_WIDE_PIXELS: f64 = 0.25;
 const STEP_CHANGE: f64 = 0.35;
+/// Standard deviation of the blur along vessels, in units of the field's resolution, that is taken out of areas of thin vessels where pixels are
+/// half as wide as the resolution or narrower: points at stenoses are off by half of the resolution along their vessels, partly by slides that are
+/// not found. Wide pixels make areas so noisy that more blur is better than less.
+const BLUR: f64 = 0.25;
+/// Typical diameter, in units of the field's resolution, up to which a vessel has this blur, and from which it has none.
+const BLURRED: f64 = 1.0;
+const SHARP: f64 = 1.5;
 /// Minimum radius, as a share of the typical one, for which differences of radii are expressed by those of areas.
 const MIN_SHARE: f64 = 0.3;
 /// Number of points on each side over which the typical area is a median, and then a mean.
@@ -75,7 +84,8 @@ pub fn measure_radii(beat: &mut BeatTree, dataset: &Dataset) -> Result<(), &'sta
         return Err("fewer than two training views show three phases of the tree");
     }
     let pixel_mm = views.iter().map(|view| view.pixel_mm).fold(0.0, f64::max);
-    let expected = Expected::new(&field, &lengths, beat.resolution_mm, pixel_mm);
+    let pixel = pixel_mm / beat.resolution_mm;
+    let expected = Expected::new(&field, &lengths, beat.resolution_mm, step_change(pixel));
     let (mut areas, mut slides) = (field.clone(), Slides::none(&beat.phases));
     for round in 0..ROUNDS + SLIDING_ROUNDS {
         if round >= ROUNDS {
@@ -86,6 +96,9 @@ pub fn measure_radii(beat: &mut BeatTree, dataset: &Dataset) -> Result<(), &'sta
         areas = solved(&views.iter().collect::<Vec<_>>(), &slides, &expected, &areas);
     }
     let areas = believed(&views, &slides, &expected, areas);
+    let at_rest = beat.phases.iter().find(|tree| Some(tree.phase) == beat.reference_phase).unwrap_or(first);
+    let blur_mm = expected.blur_mm(narrow(pixel) * BLUR * beat.resolution_mm, beat.resolution_mm);
+    let areas = sharpened(&areas, at_rest, &blur_mm);
     let least_mm = MIN_RADIUS * beat.resolution_mm;
     let radii: Vec<f64> = areas.iter().map(|area| (area.max(0.0) / PI).sqrt().max(least_mm)).collect();
     for tree in &mut beat.phases {
@@ -100,11 +113,15 @@ pub fn measure_radii(beat: &mut BeatTree, dataset: &Dataset) -> Result<(), &'sta
     Ok(())
 }
 
+/// Returns how far pixels are narrow, for a width in units of the field's resolution: from 0 for 1 to 1 for a half.
+fn narrow(pixel: f64) -> f64 {
+    (2.0 * (1.0 - pixel)).clamp(0.0, 1.0)
+}
+
 /// Returns the standard deviation of the difference of two successive radii, as a share of the typical one, for pixels of a width in units of the
 /// field's resolution.
 fn step_change(pixel: f64) -> f64 {
-    let narrow = (2.0 * (1.0 - pixel)).clamp(0.0, 1.0);
-    STEP_CHANGE_IN_WIDE_PIXELS + narrow * (STEP_CHANGE - STEP_CHANGE_IN_WIDE_PIXELS)
+    STEP_CHANGE_IN_WIDE_PIXELS + narrow(pixel) * (STEP_CHANGE - STEP_CHANGE_IN_WIDE_PIXELS)
 }
 
 /// Areas that are expected before the images are compared, and how certain they are.
@@ -122,15 +139,10 @@ struct Expected<'a> {
 }
 
 impl Expected<'_> {
-    /// Returns the expectation for branches of numbers of points, from a field of a resolution and images with pixels of a width at the isocentre.
-    fn new<'a>(field: &'a [f64], lengths: &[usize], resolution_mm: f64, pixel_mm: f64) -> Expected<'a> {
-        let mut expected = Expected {
-            field,
-            certainty: Vec::new(),
-            typical: Vec::new(),
-            goes_on: Vec::new(),
-            step_change: step_change(pixel_mm / resolution_mm),
-        };
+    /// Returns the expectation for branches of numbers of points, from a field of a resolution.
+    fn new<'a>(field: &'a [f64], lengths: &[usize], resolution_mm: f64, step_change: f64) -> Expected<'a> {
+        let mut expected =
+            Expected { field, certainty: Vec::new(), typical: Vec::new(), goes_on: Vec::new(), step_change };
         let mut rest = field;
         for n in lengths {
             let (own, others) = rest.split_at(*n);
@@ -147,6 +159,15 @@ impl Expected<'_> {
             }
         }
         expected
+    }
+
+    /// Returns the standard deviation of the blur along the vessel at each point, mm, from that of thin vessels.
+    fn blur_mm(&self, of_thin_mm: f64, resolution_mm: f64) -> Vec<f64> {
+        let at = |typical: &f64| {
+            let diameter = 2.0 * (typical / PI).sqrt() / resolution_mm;
+            of_thin_mm * ((SHARP - diameter) / (SHARP - BLURRED)).clamp(0.0, 1.0).sqrt()
+        };
+        self.typical.iter().map(at).collect()
     }
 
     /// Returns the inverse variances of the differences of successive areas, for which the differences of their radii are expected to be small.
@@ -227,12 +248,27 @@ fn believed(views: &[ShadowedView], slides: &Slides, expected: &Expected<'_>, ar
     (0..areas.len()).map(|i| expected.field[i] + share(i) * (areas[i] - expected.field[i])).collect()
 }
 
+/// Takes a blur along the vessels, of a standard deviation at each point, out of the areas of the points of a tree.
+fn sharpened(areas: &[f64], tree: &PhaseTree, blur_mm: &[f64]) -> Vec<f64> {
+    let mut first = 0;
+    let mut sharp = Vec::with_capacity(areas.len());
+    for branch in &tree.branches {
+        let own = first..first + branch.points_mm.len();
+        first = own.end;
+        let step_mm = branch.length_mm() / (own.len().max(2) - 1) as f64;
+        let steps = |blur_mm: &f64| if step_mm > 0.0 { blur_mm / step_mm } else { 0.0 };
+        let deviations: Vec<f64> = blur_mm[own.clone()].iter().map(steps).collect();
+        sharp.extend(without_blur(&areas[own], &deviations));
+    }
+    sharp
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::geometry::{CArm, Geometry, MM_PER_UNIT};
     use crate::scan::dataset::{Frame, Layout, Split, View};
-    use crate::trees::tree::{Branch, PhaseTree};
+    use crate::trees::tree::Branch;
     use glam::DVec3;
 
     const PER_MM: f64 = 0.1;
@@ -351,6 +387,34 @@ mod tests {
     fn radii_change_more_freely_in_narrow_pixels() {
         for (pixel, expected) in [(0.2, STEP_CHANGE), (0.5, STEP_CHANGE), (0.75, 0.3), (1.0, 0.25), (1.3, 0.25)] {
             assert!((step_change(pixel) - expected).abs() < 1e-12, "{pixel}: {}", step_change(pixel));
+        }
+    }
+
+    #[test]
+    fn a_blur_is_taken_out_of_each_branch_by_its_own_steps() {
+        assert_eq!([0.4, 0.5, 0.75, 1.0, 1.2].map(narrow), [1.0, 1.0, 0.5, 0.0, 0.0]);
+        let branch = |step_mm: f64| Branch {
+            points_mm: (0..4).map(|i| DVec3::new(step_mm * f64::from(i), 0.0, 0.0)).collect(),
+            radius_mm: vec![1.0; 4],
+            ..tree().phases[0].branches[0].clone()
+        };
+        let tree = PhaseTree { phase: 0, branches: vec![branch(0.5), branch(1.0), branch(0.0)] };
+        let areas = [3.0, 2.0, 3.0, 3.0];
+        let mut blur_mm = [0.5; 12];
+        blur_mm[6] = 1.0;
+        let sharp = sharpened(&areas.repeat(3), &tree, &blur_mm);
+        // Half the squared deviation in steps is 0.5, and 0.125 or 0.5; the second differences are -1, 2, -1 and 0.
+        assert_eq!(sharp[..4], [3.5, 1.0, 3.5, 3.0]);
+        assert_eq!(sharp[4..8], [3.125, 1.75, 3.5, 3.0]);
+        assert_eq!(sharp[8..], areas, "points in one place");
+    }
+
+    #[test]
+    fn thin_vessels_have_a_blur_and_wide_ones_have_none() {
+        let area = |diameter_mm: f64| 0.25 * PI * diameter_mm * diameter_mm;
+        for (diameter_mm, expected_mm) in [(1.0, 0.4), (2.0, 0.4), (2.5, 0.4 * 0.5f64.sqrt()), (3.0, 0.0), (4.0, 0.0)] {
+            let found = Expected::new(&[area(diameter_mm); 30], &[30], 2.0, STEP_CHANGE).blur_mm(0.4, 2.0);
+            assert!((found[15] - expected_mm).abs() < 1e-3, "{diameter_mm} mm: {}", found[15]);
         }
     }
 

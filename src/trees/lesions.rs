@@ -1,9 +1,11 @@
 //! Stenoses: places where a vessel is narrower than its course elsewhere lets expect.
 
 use crate::linear::Pentadiagonal;
+use crate::trees::blur::without_blur;
 use crate::trees::tree::{BeatTree, Measurement, PhaseTree, RadiiFrom};
 use glam::DVec3;
 use std::f64::consts::TAU;
+use std::ops::RangeInclusive;
 
 /// Diameter stenosis from which a narrowing is a lesion, percent. Healthy vessels of real anatomy vary by up to 25 %.
 pub const MIN_PERCENT: f64 = 30.0;
@@ -15,8 +17,11 @@ const REFERENCE_MM: f64 = 100.0;
 const ABOVE: f64 = 0.75;
 /// Rounds of the reference; its weights no longer change then.
 const ROUNDS: usize = 20;
-/// Length at both ends of a vessel in which no lesion is looked for, in units of the field's resolution: ends are rounded.
-const END: f64 = 2.0;
+/// Part of a lesion that must lie inside the vessel: where the narrowing exceeds this share of its maximum.
+const CORE: f64 = 0.5;
+/// Length at both ends of a vessel in which no core of a lesion may lie, in units of the field's resolution: ends are rounded. At the start of a
+/// vessel that leaves another one, the part inside the lumen of that one is added.
+const END: f64 = 1.5;
 /// Length on both sides in which a vessel must be as wide as the reference, in units of the field's resolution.
 const BESIDE: f64 = 10.0;
 /// Standard deviation of the field's blur along a vessel, in units of the field's resolution: the minimum of its Gaussians.
@@ -25,8 +30,6 @@ const BLUR: f64 = 0.4;
 const START_POINTS: usize = 6;
 /// Minimum length of a lesion, in units of the field's resolution: shorter narrowings are noise.
 const MIN_LENGTH: f64 = 1.4;
-/// Lower bound of an area without the blur, as a share of the measured one.
-const MIN_AREA: f64 = 0.5;
 /// Minimum reference diameter, in units of the field's resolution, where radii are those of the field and where they are those of the images:
 /// whether a thinner vessel is narrowed cannot be told.
 const MIN_REFERENCE: f64 = 1.0;
@@ -88,6 +91,8 @@ struct Course {
     /// Length along the vessels from the root to each place, mm.
     along_mm: Vec<f64>,
     radius_mm: Vec<f64>,
+    /// Length at the start that lies inside the vessel from which this one leaves, mm: the radius there.
+    inside_mm: f64,
 }
 
 /// Finds the stenoses of a tree.
@@ -96,7 +101,8 @@ struct Course {
 /// taken out of the area to second order: A - sigma^2 / 2 A''. The reference is the smooth line of asymmetric least squares (Eilers and Boelens, Baseline
 /// correction with asymmetric least squares smoothing, 2005) through the radii: narrowings hardly lower it. Where the vessel is
 /// nowhere as wide on one of the sides, the reference is the greatest radius of that side. A lesion is a part
-/// whose diameter is below nine tenths of the reference, and somewhere [`MIN_PERCENT`] or more below it.
+/// whose diameter is below nine tenths of the reference, and somewhere [`MIN_PERCENT`] or more below it. Its core, which is narrowed by more
+/// than half of the maximum, lies away from the ends of the vessel, and outside of the vessel from which it leaves.
 pub fn lesions(tree: &PhaseTree, measurement: Measurement) -> Vec<Lesion> {
     straight_vessels(tree, measurement).into_iter().flat_map(|vessel| vessel.lesions).collect()
 }
@@ -145,7 +151,9 @@ fn courses(tree: &PhaseTree) -> Vec<Course> {
         if is_joined[first] {
             continue;
         }
-        let mut course = Course { places: Vec::new(), along_mm: Vec::new(), radius_mm: Vec::new() };
+        let parent = tree.branches[first].parent;
+        let inside_mm = parent.and_then(|parent| tree.branches[parent].radius_mm.last().copied()).unwrap_or(0.0);
+        let mut course = Course { places: Vec::new(), along_mm: Vec::new(), radius_mm: Vec::new(), inside_mm };
         let mut next = Some(first);
         while let Some(index) = next {
             is_joined[index] = true;
@@ -210,7 +218,9 @@ impl Course {
         }
         let (start_mm, end_mm) = (self.along_mm[0], self.along_mm[n - 1]);
         let step_mm = (end_mm - start_mm) / (n - 1) as f64;
-        let radius_mm = sharpened(&self.radius_mm, blur * resolution_mm / step_mm);
+        let blurred: Vec<f64> = self.radius_mm.iter().map(|radius| radius * radius).collect();
+        let areas = without_blur(&blurred, &vec![blur * resolution_mm / step_mm; n]);
+        let radius_mm: Vec<f64> = areas.into_iter().map(f64::sqrt).collect();
         let smooth_mm = reference(&radius_mm, step_mm)?;
         // A vessel that becomes narrower and stays so, as behind a bifurcation, has no stenosis.
         let whole_mm = recovered(&radius_mm, (BESIDE * resolution_mm / step_mm).ceil() as usize);
@@ -218,7 +228,7 @@ impl Course {
         let narrowing: Vec<f64> = radius_mm.iter().zip(&reference_mm).map(|(r, whole)| 1.0 - r / whole).collect();
         let is_inner = |i: usize| {
             let margin_mm = END * resolution_mm;
-            self.along_mm[i] - start_mm > margin_mm && end_mm - self.along_mm[i] > margin_mm
+            self.along_mm[i] - start_mm > margin_mm + self.inside_mm && end_mm - self.along_mm[i] > margin_mm
         };
         let mut found = Vec::new();
         let mut first = 0;
@@ -228,7 +238,9 @@ impl Course {
             let is_wide = 2.0 * reference_mm[worst] >= min_reference * resolution_mm;
             let length_mm = self.along_mm[last] - self.along_mm[first] + step_mm;
             let is_long = length_mm >= MIN_LENGTH * resolution_mm;
-            if 100.0 * narrowing[worst] >= MIN_PERCENT && is_wide && is_long && is_inner(first) && is_inner(last) {
+            let core = core(&narrowing, worst);
+            let is_inside = is_inner(*core.start()) && is_inner(*core.end());
+            if 100.0 * narrowing[worst] >= MIN_PERCENT && is_wide && is_long && is_inside {
                 let (branch, point) = self.places[worst];
                 found.push(Lesion {
                     branch,
@@ -253,15 +265,12 @@ impl Course {
     }
 }
 
-/// Takes a blur along the vessel, whose standard deviation is a number of steps, out of the areas of radii at regular steps.
-fn sharpened(radius_mm: &[f64], deviation_steps: f64) -> Vec<f64> {
-    let area = |i: usize| radius_mm[i].powi(2);
-    let last = radius_mm.len() - 1;
-    let at = |i: usize| {
-        let bend = area(i.saturating_sub(1)) - 2.0 * area(i) + area((i + 1).min(last));
-        (area(i) - 0.5 * deviation_steps.powi(2) * bend).max(MIN_AREA * area(i)).sqrt()
-    };
-    (0..radius_mm.len()).map(at).collect()
+/// Returns the places around the greatest narrowing of a lesion where the narrowing exceeds [`CORE`] of it.
+fn core(narrowing: &[f64], worst: usize) -> RangeInclusive<usize> {
+    let is_core = |share: &&f64| **share > CORE * narrowing[worst];
+    let before = narrowing[..worst].iter().rev().take_while(is_core).count();
+    let behind = narrowing[worst + 1..].iter().take_while(is_core).count();
+    worst - before..=worst + behind
 }
 
 /// Returns, for each place, the smaller of the greatest radii before and behind it, within a number of places.
@@ -378,18 +387,6 @@ mod tests {
     }
 
     #[test]
-    fn a_blur_along_the_vessel_is_taken_out() {
-        let area = |i: i32| narrowed(f64::from(i) * STEP_MM, 32.0, 10.0, 0.6).powi(2);
-        // Standard deviation of the kernel 1, 2, 1 in steps.
-        let deviation = 0.5f64.sqrt();
-        let blurred: Vec<f64> =
-            (0..80).map(|i| (0.25 * area(i - 1) + 0.5 * area(i) + 0.25 * area(i + 1)).sqrt()).collect();
-        let sharp = sharpened(&blurred, deviation);
-        let off = |radii: &[f64]| (0..80).map(|i| (radii[i] - area(i as i32).sqrt()).abs()).fold(0.0, f64::max);
-        assert!(off(&sharp) < 0.35 * off(&blurred), "{} of {}", off(&sharp), off(&blurred));
-    }
-
-    #[test]
     fn tapers_bifurcations_and_small_variations_are_no_lesions() {
         let wavy = |mm: f64| (1.7 - 0.006 * mm) * (1.0 + 0.08 * (0.35 * mm).sin());
         let trunk = branch(None, DVec3::ZERO, DVec3::X, 60, wavy);
@@ -424,6 +421,41 @@ mod tests {
         assert_eq!(lesions(&vessel(0.9, 40.0), COARSE).len(), 1);
         assert_eq!(lesions(&vessel(0.75, 40.0), COARSE), [], "1.5 mm at a resolution of 1.6 mm");
         assert_eq!(lesions(&vessel(0.9, 77.0), COARSE), [], "at the end");
+    }
+
+    /// A lesion of 70 % that is narrowed by a tenth up to 5 mm before and behind its middle, and by half of its maximum up to 3.5 mm.
+    fn long_lesion(middle_mm: f64) -> impl Fn(f64) -> f64 {
+        move |mm| 1.5 * narrowed(mm, middle_mm, 18.0, 0.7)
+    }
+
+    #[test]
+    fn the_core_of_a_lesion_lies_away_from_the_ends() {
+        let found = |middle_mm: f64| {
+            lesions(&tree(vec![branch(None, DVec3::ZERO, DVec3::X, 101, long_lesion(middle_mm))]), COARSE)
+        };
+        let margin_mm = END * COARSE.resolution_mm;
+        let at_start = found(6.5);
+        let [lesion] = &at_start[..] else { panic!("{at_start:?}") };
+        assert!((lesion.from_root_mm - 6.5).abs() < 2.0 * STEP_MM, "{lesion:?}");
+        let [(_, first), .., (_, last)] = lesion.places[..] else { panic!("{lesion:?}") };
+        let (first_mm, last_mm) = (first as f64 * STEP_MM, last as f64 * STEP_MM);
+        assert!(first_mm < margin_mm, "a tenth begins within the end: {first_mm}");
+        assert!((lesion.length_mm - (last_mm - first_mm + STEP_MM)).abs() < 1e-9, "{lesion:?}");
+        assert_eq!(found(73.5).len(), 1, "at the other end");
+        assert_eq!((found(5.0), found(75.0)), (Vec::new(), Vec::new()), "the core reaches into an end");
+    }
+
+    #[test]
+    fn a_vessel_begins_where_it_leaves_the_lumen_of_another_one() {
+        let found = |middle_mm: f64| {
+            let trunk = branch(None, DVec3::ZERO, DVec3::X, 30, |_| 1.6);
+            let end = trunk.points_mm[29];
+            let main = branch(Some(0), end, DVec3::X, 30, |_| 1.6);
+            let side = branch(Some(0), end, DVec3::Y, 101, long_lesion(middle_mm));
+            lesions(&tree(vec![trunk, side, main]), COARSE)
+        };
+        assert_eq!(found(6.5), [], "the core would be accepted at the start of a vessel that leaves no other one");
+        assert!(found(9.0).iter().map(|lesion| lesion.branch).eq([1]), "{:?}", found(9.0));
     }
 
     #[test]
