@@ -761,6 +761,15 @@ typedef struct {
    * Probability that a true vessel is within 3 mm of each point, 0 to 1.
    */
   double *existence;
+  /**
+   * Length of the gaps in each branch, mm; 0 where there are none. The field shows no vessel in a gap: two vessels are linked there because
+   * one points at the other. May be null.
+   */
+  double *branch_gap_mm;
+  /**
+   * Set to 1 where radii are those that the frames show, to 0 where they are those of the field, which shows thin vessels blurred.
+   */
+  uint32_t radii_from_images;
 } nertca_tree;
 
 /**

@@ -580,6 +580,7 @@ class Reconstruction:
                 "branch_first": np.empty(struct.branches, np.uint32),
                 "branch_points": np.empty(struct.branches, np.uint32),
             }
+            gap_mm = np.empty(struct.branches)
             points_mm = np.empty((struct.points, 3))
             radius_mm = np.empty(struct.points)
             of_doubt = {name: np.empty(struct.points) for name in ("doubt_mm", "doubt_with_motion_mm", "existence")}
@@ -587,6 +588,7 @@ class Reconstruction:
                 **of_branches,
                 "points_mm": points_mm,
                 "radius_mm": radius_mm,
+                "branch_gap_mm": gap_mm,
                 **of_doubt,
             }
             kept = {name: writable(array) for name, array in arrays.items()}
@@ -600,12 +602,17 @@ class Reconstruction:
                 parent=int(parent) if parent >= 0 else None,
                 points_mm=points_mm[first : first + count],
                 radius_mm=radius_mm[first : first + count],
+                gap_mm=float(gap),
                 **{name: values[first : first + count] for name, values in of_doubt.items()},
             )
-            for phase, parent, first, count in zip(*of_branches.values())
+            for phase, parent, first, count, gap in zip(*of_branches.values(), gap_mm)
         ]
         return Tree(
-            threshold_per_mm=struct.threshold_per_mm, followed=struct.followed == 1, branches=branches, lesions=lesions
+            threshold_per_mm=struct.threshold_per_mm,
+            followed=struct.followed == 1,
+            branches=branches,
+            lesions=lesions,
+            radii_from_images=struct.radii_from_images == 1,
         )
 
     def _lesions(self, handle: Any) -> list[Lesion]:

@@ -173,6 +173,8 @@ class Branch:
     """Half width for the material point, mm, which also holds its motion along the vessel; NaN where points are not followed."""
     existence: Optional[npt.NDArray[np.float64]] = None
     """Probability that a true vessel is within 3 mm of each point, 0 to 1."""
+    gap_mm: float = 0.0
+    """Length of the gaps in the branch, mm: the field shows no vessel there, and two vessels are linked because one points at the other."""
 
 
 @dataclass(frozen=True)
@@ -212,6 +214,8 @@ class Tree:
     """Phase by phase, each behind its parent."""
     lesions: list[Lesion] = field(default_factory=list)
     """Stenoses of 30 % or more, phase by phase."""
+    radii_from_images: bool = False
+    """Whether radii are those that the frames show; otherwise they are those of the field, which shows thin vessels blurred."""
 
     def at(self, phase: int) -> list[Branch]:
         """The branches of one cardiac phase."""

@@ -4,7 +4,7 @@ use crate::capi::reconstruction::{Reconstruction, nertca_reconstruction, on_reco
 use crate::capi::status::{Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_NOT_READY, Outcome, nertca_status};
 use crate::capi::types::{nertca_lesion, nertca_tree, read, write};
 use crate::trees::lesions::{Lesion, lesions};
-use crate::trees::tree::{BeatTree, Branch};
+use crate::trees::tree::{BeatTree, Branch, RadiiFrom};
 use std::sync::PoisonError;
 
 /// Finds the vessels at all phases as trees of centrelines with radii. If all arrays of `tree` are null, the call searches and
@@ -44,6 +44,7 @@ pub unsafe extern "C" fn nertca_reconstruction_tree(
         let told = nertca_tree {
             threshold_per_mm: found.threshold_per_mm,
             followed: u32::from(found.reference_phase.is_some()),
+            radii_from_images: u32::from(found.radii_from == RadiiFrom::Images),
             branches: flat.branch_phase.len(),
             points: flat.radius_mm.len(),
             ..asked
@@ -67,12 +68,13 @@ pub unsafe extern "C" fn nertca_reconstruction_tree(
             copy(&flat.points_mm, asked.points_mm);
             copy(&flat.radius_mm, asked.radius_mm);
         }
-        let of_doubt = [
+        let optional = [
             (&flat.doubt_mm, asked.doubt_mm),
             (&flat.doubt_with_motion_mm, asked.doubt_with_motion_mm),
             (&flat.existence, asked.existence),
+            (&flat.branch_gap_mm, asked.branch_gap_mm),
         ];
-        for (values, array) in of_doubt.into_iter().filter(|(_, array)| !array.is_null()) {
+        for (values, array) in optional.into_iter().filter(|(_, array)| !array.is_null()) {
             // SAFETY: the array is not null, and the header requires as many elements as were compared above.
             unsafe { copy(values, array) };
         }
@@ -150,8 +152,8 @@ fn wants_copies(asked: &nertca_tree) -> Outcome<bool> {
         ("points_mm", asked.points_mm.is_null()),
         ("radius_mm", asked.radius_mm.is_null()),
     ];
-    let doubt = [asked.doubt_mm, asked.doubt_with_motion_mm, asked.existence];
-    if missing.iter().all(|(_, null)| *null) && doubt.iter().all(|array| array.is_null()) {
+    let optional = [asked.doubt_mm, asked.doubt_with_motion_mm, asked.existence, asked.branch_gap_mm];
+    if missing.iter().all(|(_, null)| *null) && optional.iter().all(|array| array.is_null()) {
         return Ok(false);
     }
     match missing.iter().find(|(_, null)| *null) {
@@ -186,6 +188,7 @@ struct FlatTree {
     doubt_mm: Vec<f64>,
     doubt_with_motion_mm: Vec<f64>,
     existence: Vec<f64>,
+    branch_gap_mm: Vec<f64>,
 }
 
 impl FlatTree {
@@ -196,6 +199,7 @@ impl FlatTree {
             for branch @ Branch { parent, points_mm, radius_mm, .. } in &tree.branches {
                 flat.branch_phase.push(tree.phase);
                 flat.branch_parent.push(parent.map_or(-1, |parent| (first + parent) as i32));
+                flat.branch_gap_mm.push(branch.gap_mm);
                 flat.branch_first.push(flat.radius_mm.len() as u32);
                 flat.branch_points.push(points_mm.len() as u32);
                 flat.points_mm.extend(points_mm.iter().flat_map(|point| point.to_array()));
@@ -209,5 +213,45 @@ impl FlatTree {
             }
         }
         flat
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::trees::tree::PhaseTree;
+    use glam::DVec3;
+
+    #[test]
+    fn branches_of_all_phases_follow_each_other_with_their_gaps() {
+        let branch = |parent: Option<usize>, points: usize, gap_mm: f64| Branch {
+            parent,
+            points_mm: vec![DVec3::ONE; points],
+            radius_mm: vec![0.5; points],
+            agreement: Vec::new(),
+            doubt: Vec::new(),
+            gap_mm,
+        };
+        let tree = |phase: u32, gap_mm: f64| PhaseTree {
+            phase,
+            branches: vec![branch(None, 3, 0.0), branch(Some(0), 2, gap_mm)],
+        };
+        let beat = BeatTree {
+            reference_phase: None,
+            threshold_per_mm: 0.02,
+            resolution_mm: 1.0,
+            spacing_mm: 0.5,
+            vessel_per_mm: None,
+            radii_from: RadiiFrom::Field,
+            views: Vec::new(),
+            phases: vec![tree(0, 4.5), tree(1, 2.0)],
+            measured_mm: Vec::new(),
+        };
+        let flat = FlatTree::of(&beat);
+        assert_eq!(flat.branch_gap_mm, [0.0, 4.5, 0.0, 2.0]);
+        assert_eq!(flat.branch_phase, [0, 0, 1, 1]);
+        assert_eq!(flat.branch_parent, [-1, 0, -1, 2]);
+        assert_eq!((flat.branch_first, flat.branch_points), (vec![0, 3, 5, 8], vec![3, 2, 3, 2]));
+        assert_eq!((flat.points_mm.len(), flat.radius_mm.len()), (30, 10));
     }
 }

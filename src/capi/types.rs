@@ -377,6 +377,11 @@ pub struct nertca_tree {
     pub doubt_with_motion_mm: *mut f64,
     /// Probability that a true vessel is within 3 mm of each point, 0 to 1.
     pub existence: *mut f64,
+    /// Length of the gaps in each branch, mm; 0 where there are none. The field shows no vessel in a gap: two vessels are linked there because
+    /// one points at the other. May be null.
+    pub branch_gap_mm: *mut f64,
+    /// Set to 1 where radii are those that the frames show, to 0 where they are those of the field, which shows thin vessels blurred.
+    pub radii_from_images: u32,
 }
 
 /// A stenosis of the vessels that were found: a place where a vessel is narrower than its course elsewhere lets expect.

@@ -269,8 +269,9 @@ fn centrelines(field: &SampledField, vessels: &Mask, resolution_mm: f64, least_b
         let mut points_mm = forest.places_mm(&chain.nodes);
         // Voxels that touch are less than two steps of the grid apart.
         let touching_mm = 2.0 * field.grid.spacing_mm.max_element();
+        // The sum of no numbers is -0, which would be written into files.
         let links_mm = points_mm.windows(2).map(|pair| pair[0].distance(pair[1]));
-        let gap_mm = links_mm.filter(|link_mm| *link_mm > touching_mm).sum();
+        let gap_mm = links_mm.filter(|link_mm| *link_mm > touching_mm).fold(0.0, |all_mm, link_mm| all_mm + link_mm);
         let start = chain.parent.and_then(|parent| lines[parent].points_mm.last().copied());
         points_mm[0] = start.unwrap_or(points_mm[0]);
         let mut points_mm = from_voxels(&points_mm, resolution_mm);
@@ -394,6 +395,7 @@ mod tests {
         let mut field = uneven(&[tube(8.0, 11.0)]);
         let lines = found_in(&mut field);
         assert_eq!(lines.len(), 1, "lines of an uneven field");
+        assert!(lines[0].gap_mm == 0.0 && lines[0].gap_mm.is_sign_positive(), "no gap");
         let lumen = Lumen { field: &field, resolution_mm: RESOLUTION_MM, vessel_per_mm: Some(VESSEL_PER_MM) };
         let radii_mm = lumen.radii_mm(&lines[0].points_mm);
         let middle = &radii_mm[radii_mm.len() / 4..radii_mm.len() * 3 / 4];

@@ -4,7 +4,7 @@ use crate::error::Result;
 use crate::export::dicom::{ANATOMY, CORONARY, Code, LABEL};
 use crate::export::structured::{self, ContentItem, PrivateScheme, Relationship, ReportSeeds, Value};
 use crate::trees::lesions::{Lesion, lesions};
-use crate::trees::tree::{BeatTree, Branch, Doubt, PhaseTree};
+use crate::trees::tree::{BeatTree, Branch, Doubt, PhaseTree, RadiiFrom};
 use std::path::Path;
 
 /// Rounding of numbers, per unit: a tenth of a micrometre.
@@ -64,6 +64,7 @@ const METHOD: Code = sct("370129005", "Measurement Method");
 const CURVE_FITTED: Code = dcm("122489", "Curve Fitted Reference");
 const SOURCE: Code = dcm("121112", "Source of Measurement");
 const FROM_ROOT: Code = own("FROMROOT", "Length along the vessels from the root of the tree");
+const GAP: Code = own("GAP", "Length of gaps in which the field shows no vessel");
 const DOUBT: Code = own("DOUBT", "Half width of the 68 % interval across the vessel");
 const DOUBT_WITH_MOTION: Code = own("DOUBTMOTION", "Half width of the 68 % interval with motion along the vessel");
 const EXISTENCE: Code = own("EXISTENCE", "Probability that a vessel exists within 3 mm");
@@ -152,8 +153,13 @@ impl PhaseGroups<'_> {
     fn group(&self, subject: Subject, measurements: Vec<ContentItem>) -> ContentItem {
         let phase = self.tree.phase;
         let parameters = format!(
-            "{LABEL}. Vessel above {:.4e} per mm; resolution of the field {:.2} mm",
-            self.beat.threshold_per_mm, self.beat.resolution_mm
+            "{LABEL}. Vessel above {:.4e} per mm; resolution of the field {:.2} mm; diameters from the {}",
+            self.beat.threshold_per_mm,
+            self.beat.resolution_mm,
+            match self.beat.radii_from {
+                RadiiFrom::Images => "images",
+                RadiiFrom::Field => "field",
+            }
         );
         let order = Value::Number(f64::from(phase), NO_UNIT);
         let about = [
@@ -200,6 +206,7 @@ impl PhaseGroups<'_> {
             derived(MEAN, branch.mean_diameter_mm()),
             derived(MINIMUM, branch.min_diameter_mm()),
         ];
+        measurements.extend((branch.gap_mm > 0.0).then(|| number(GAP, branch.gap_mm, MM)));
         measurements.extend(branch.median_doubt_mm().map(|mm| number(DOUBT, mm, MM)));
         measurements.extend(branch.existence().map(|share| number(EXISTENCE, share, NO_UNIT)));
         self.group(subject, measurements)
@@ -248,7 +255,6 @@ fn doubt(doubt: &Doubt) -> Vec<ContentItem> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trees::tree::RadiiFrom;
     use glam::DVec3;
 
     fn beat(reference_phase: Option<u32>) -> BeatTree {
@@ -303,6 +309,22 @@ mod tests {
         for a in 0..single.len() {
             (0..a).for_each(|b| assert_ne!(single[a].1, single[b].1, "{a} and {b}"));
         }
+    }
+
+    #[test]
+    fn gaps_and_the_source_of_diameters_are_reported() {
+        let Value::Text(parameters) = value_of(&groups(&beat(Some(0)))[1], ALGORITHM_PARAMETERS).clone() else {
+            panic!("a text")
+        };
+        assert!(parameters.ends_with("diameters from the field"), "{parameters}");
+        let mut other = beat(Some(0));
+        assert!(groups(&other)[1].children.iter().all(|item| item.name != GAP), "a branch without gaps");
+        other.radii_from = RadiiFrom::Images;
+        other.phases[0].branches[0].gap_mm = 4.5;
+        let branch = &groups(&other)[1];
+        assert_eq!(value_of(branch, GAP), &Value::Number(4.5, MM));
+        let Value::Text(parameters) = value_of(branch, ALGORITHM_PARAMETERS) else { panic!("a text") };
+        assert!(parameters.ends_with("diameters from the images"), "{parameters}");
     }
 
     #[test]

@@ -96,7 +96,9 @@ fn expect_the_same_in_c(newest: &Path, tree: &Value) {
     let early = unsafe { nertca_reconstruction_lesion(made, 0, null_mut(), &mut count) };
     assert_eq!((early, count), (NERTCA_ERROR_NOT_READY, 7), "no tree was asked for");
     let mut room = nertca_tree { size: size_of::<nertca_tree>(), ..unsafe { std::mem::zeroed() } };
+    room.radii_from_images = 7;
     ok(unsafe { nertca_reconstruction_tree(made, &mut room) });
+    assert_eq!(room.radii_from_images, 0, "a checkpoint has no frames to measure radii in");
     ok(unsafe { nertca_reconstruction_lesion(made, 0, null_mut(), &mut count) });
     let wanted = tree["lesions"].as_array().unwrap();
     assert!(count >= wanted.len(), "{count} at all phases");
@@ -167,6 +169,8 @@ fn a_stenosis_of_a_phantom_is_found_where_it_is_and_a_healthy_tree_has_none() {
     let off = |ours: &str, theirs: &str| (number(lesion, ours) - number(true_lesion, theirs)).abs();
     println!("{lesion}, {true_lesion}");
     assert_eq!(read(&ill.join("tree.json"))["radii_from"], "images");
+    let page = std::fs::read_to_string(ill.join("run/report.html")).unwrap();
+    assert!(page.contains("Diameters are those that the angiograms show."));
     assert!(off("min_diameter_mm", "min_diameter_mm") < 0.25, "{lesion}, {true_lesion}");
     assert!(off("stenosis_percent", "percent") < 15.0, "{lesion}, {true_lesion}");
     assert!(off("from_root_mm", "from_ostium_mm") < 3.0, "{lesion}, {true_lesion}");

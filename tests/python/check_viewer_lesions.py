@@ -8,7 +8,8 @@ import sys
 from browser import Page
 
 with open(sys.argv[2], encoding="utf-8") as file:
-    phase = json.load(file)["phases"][0]
+    tree = json.load(file)
+phase = tree["phases"][0]
 with Page(sys.argv[1] + "&tree=1") as page:
     page.wait("document.querySelectorAll('#tree polyline').length > 0 && !busy")
     squares = page.evaluate("document.querySelector('#tree .lesion').getAttribute('d').split('M').length - 1")
@@ -22,6 +23,8 @@ with Page(sys.argv[1] + "&tree=1") as page:
     told = page.evaluate("document.getElementById('tree-text').textContent")
     print(told)
     assert told.startswith(f"Branch {lesion['branch']}:"), told
+    source = {"images": "(diameters as the images show them)", "field": "(diameters as the field shows them)"}[tree["radii_from"]]
+    assert source in told, (source, told)
     # The page rounds halves up, Python to even numbers.
     assert f"stenosis of {lesion['stenosis_percent']:.0f} %" in told or f"stenosis of {lesion['stenosis_percent'] + .01:.0f} %" in told, told
     assert f"{lesion['min_diameter_mm']:.2f} mm instead of {lesion['reference_diameter_mm']:.2f} mm" in told, told

@@ -12,7 +12,7 @@ use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk::scan::gating::SYSTOLE_SHARE;
 use nertca_vk::score::pictures::Window;
 use nertca_vk::trees::files::{note, to_json};
-use nertca_vk::trees::tree::{BeatTree, CONFIDENCE, DOUBTFUL, EXISTS_WITHIN_MM, PhaseTree, TreeView};
+use nertca_vk::trees::tree::{BeatTree, CONFIDENCE, DOUBTFUL, EXISTS_WITHIN_MM, PhaseTree, RadiiFrom, TreeView};
 use serde_json::{Value, json};
 
 const SCRIPT: &str = include_str!("report_trees.js");
@@ -66,7 +66,7 @@ impl TreeSection {
     pub fn markup(&self) -> Markup {
         html! {
             h2 { "Vessels as a tree" }
-            p.lead { "Centrelines over the angiograms of the training views; " (self.note) "." }
+            p.lead { "Centrelines over the angiograms of the training views; " (self.note) ". " (radii_told(self.beat.radii_from)) }
             style { (PreEscaped(STYLE)) }
             noscript { p.warn { "A script of this page draws the lines, but scripts are switched off in this \
                                  browser." } }
@@ -123,9 +123,20 @@ fn view_data(dataset: &Dataset, view: usize, step: usize) -> Result<Value> {
     }))
 }
 
+/// Returns the sentence about the source of the radii.
+fn radii_told(radii_from: RadiiFrom) -> &'static str {
+    match radii_from {
+        RadiiFrom::Images => "Diameters are those that the angiograms show.",
+        RadiiFrom::Field => {
+            "Diameters are those of the dynamic field, which shows thin vessels and short stenoses blurred."
+        }
+    }
+}
+
 fn table(beat: &BeatTree, name: &str, tree: &PhaseTree) -> Markup {
     let is_mean = tree.doubtful_mm().is_some();
     let has_doubt = tree.branches.iter().all(|branch| !branch.doubt.is_empty());
+    let has_gaps = tree.branches.iter().any(|branch| branch.gap_mm > 0.0);
     html! {
         div {
             h3 { (name) " (phase " (tree.phase) ")" }
@@ -133,7 +144,8 @@ fn table(beat: &BeatTree, name: &str, tree: &PhaseTree) -> Markup {
                 tr { th { "branch" } th { "parent" } th { "length, mm" } th { "mean diameter, mm" } th { "minimum, \
                                                                                                           mm" }
                     @if has_doubt { th { "known to, mm" } th { "exists, %" } }
-                    @if is_mean { th { "other fits, %" } } }
+                    @if is_mean { th { "other fits, %" } }
+                    @if has_gaps { th { "gap, mm" } } }
                 @for (index, branch) in tree.branches.iter().enumerate() {
                     tr data-branch=(index) data-phase=(tree.phase) {
                         td { i data-colour=(index) {} (index) }
@@ -146,9 +158,14 @@ fn table(beat: &BeatTree, name: &str, tree: &PhaseTree) -> Markup {
                             td { (branch.existence().map_or("-".into(), |share| format!("{:.0}", 100.0 * share))) }
                         }
                         @if is_mean { td { (branch.mean_agreement().map_or("-".into(), |share| format!("{:.0}", 100.0 * share))) } }
+                        @if has_gaps { td { (if branch.gap_mm > 0.0 { format!("{:.1}", branch.gap_mm) } else { "-".into() }) } }
                     }
                 }
-                tr { td { "all" } td {} td { (format!("{:.1}", tree.length_mm())) } td {} td {} @if has_doubt { td {} td {} } @if is_mean { td {} } }
+                tr { td { "all" } td {} td { (format!("{:.1}", tree.length_mm())) } td {} td {} @if has_doubt { td {} td {} } @if is_mean { td {} } @if has_gaps { td {} } }
+            }
+            @if has_gaps {
+                p { "\"Gap\" is the length of a branch over which the field shows no vessel: two vessels were linked there because one points at "
+                    "the other, as on both sides of a severe stenosis." }
             }
             @if has_doubt {
                 p { "\"Known to\" is the median, along the branch, of the half width of the interval that contains the true centreline with a "

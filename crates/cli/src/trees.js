@@ -42,7 +42,7 @@ const trees = (() => {
     return tree.phases[before % n].branches.map((branch, b) => ({
       points_mm: branch.points_mm.map((p, i) => p.map((v, axis) => mix(v, next[b].points_mm[i][axis], share))),
       radius_mm: branch.radius_mm.map((r, i) => mix(r, next[b].radius_mm[i], share)),
-      doubt_mm: branch.doubt_mm, doubt_direction: branch.doubt_direction, existence: branch.existence,
+      doubt_mm: branch.doubt_mm, doubt_direction: branch.doubt_direction, existence: branch.existence, gap_mm: branch.gap_mm,
     }));
   }
 
@@ -75,13 +75,20 @@ const trees = (() => {
       + `${lesion.min_diameter_mm.toFixed(2)} mm instead of ${lesion.reference_diameter_mm.toFixed(2)} mm`).join("");
   }
 
-  // Returns the text about a clicked branch.
-  function told(branches, place, lesions) {
+  // Returns the text about a clicked branch of a tree.
+  function told(tree, branches, place, lesions) {
     const m = measure(branches[place.branch], place), mm = v => v.toFixed(2) + " mm";
     return `Branch ${place.branch}: ${m.length_mm.toFixed(1)} mm long; minimum diameter ${mm(m.least_mm)}, `
-      + `mean ${mm(m.mean_mm)}, ${mm(m.here_mm)} at this point, ${m.along_mm.toFixed(1)} mm from its start`
+      + `mean ${mm(m.mean_mm)}, ${mm(m.here_mm)} at this point, ${m.along_mm.toFixed(1)} mm from its start `
+      + (tree.radii_from === "images" ? "(diameters as the images show them)" : "(diameters as the field shows them)")
+      + gapTold(branches[place.branch])
       + doubtTold(branches[place.branch], place)
       + lesionsTold(branches[place.branch], lesions.filter(lesion => lesion.branch === place.branch));
+  }
+
+  // Returns the text about the gaps in a branch; nothing where there are none.
+  function gapTold({gap_mm}) {
+    return gap_mm ? `; the field shows nothing over ${gap_mm.toFixed(1)} mm of it, where two vessels are linked because one points at the other` : "";
   }
 
   // Returns the text about the doubt at a place; nothing where doubt is not stated.

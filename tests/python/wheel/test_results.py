@@ -180,6 +180,7 @@ def test_a_tree_is_its_own_truth(context: Context) -> None:
         tree = made.tree(threshold_per_mm=threshold)
         for branch in tree.branches:
             assert branch.doubt_mm.shape == branch.existence.shape == branch.radius_mm.shape
+            assert branch.gap_mm >= 0.0
             assert (branch.doubt_mm > 0).all() and (0 < branch.existence).all() and (branch.existence < 1).all()
         at_rest = nertca_vk.Tree(tree.threshold_per_mm, False, tree.at(0))
         made.set_true_tree(at_rest)
@@ -194,6 +195,14 @@ def test_a_tree_is_its_own_truth(context: Context) -> None:
         short = [nertca_vk.Branch(0, None, branch.points_mm[:-1], branch.radius_mm) for branch in tree.at(0)]
         with pytest.raises(nertca_vk.ArgumentError, match="points_mm"):
             made.set_true_tree(nertca_vk.Tree(0.0, False, short))
+
+
+def test_radii_of_followed_points_come_from_the_frames(context: Context) -> None:
+    with filled(context, **{"gaussians.form": "deformable"}) as made:
+        made.train()
+        threshold = float(np.quantile(made.volume(Grid.around_isocentre(20.0, 1.0)), 0.98))
+        tree = made.tree(threshold_per_mm=threshold)
+        assert tree.followed and tree.radii_from_images
 
 
 def test_phases_come_from_r_peaks(context: Context) -> None:
@@ -235,11 +244,13 @@ def test_a_phantoms_vessels_become_a_tree(tmp_path: Path) -> None:
         program("tree", run, "--out", tmp_path / "beat.json")
         truth = json.loads((tmp_path / "beat.json").read_text())
         assert tree.followed == truth["tracked"] and tree.threshold_per_mm > 0
+        assert not tree.radii_from_images, "a checkpoint has no frames to measure radii in"
         for phase, row in enumerate(truth["phases"]):
             found = tree.at(phase)
             assert len(found) == len(row["branches"])
             for ours, theirs in zip(found, row["branches"]):
                 np.testing.assert_allclose(ours.points_mm, theirs["points_mm"], atol=0.01)
+                assert abs(ours.gap_mm - theirs.get("gap_mm", 0.0)) < 0.01
                 np.testing.assert_allclose(ours.radius_mm, theirs["radius_mm"], atol=0.01)
         wanted = [(row["phase"], lesion) for row in truth["phases"] for lesion in row["lesions"]]
         assert len(tree.lesions) == len(wanted)
