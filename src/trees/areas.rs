@@ -452,6 +452,19 @@ mod tests {
     }
 
     #[test]
+    fn a_blur_that_slides_leave_is_taken_out_in_narrow_pixels() {
+        // Points slide farther than slides that are looked for. The blur alone would leave a least radius of 0.31 instead of 0.28 mm.
+        let mut beat = BeatTree { resolution_mm: 1.5 * PIXEL_MM, ..tree() };
+        for (phase, along_mm) in beat.phases.iter_mut().zip([3.5, -3.5, 3.5, -3.5, 0.0]) {
+            phase.branches[0].points_mm.iter_mut().for_each(|point| point.z += along_mm);
+        }
+        measure_radii(&mut beat, &dataset()).unwrap();
+        let radii_mm = &beat.phases[4].branches[0].radius_mm;
+        let least_mm = radii_mm[28..42].iter().copied().fold(f64::INFINITY, f64::min);
+        assert!((least_mm - radius_mm(4.0)).abs() < 0.015, "{least_mm} mm: {radii_mm:?}");
+    }
+
+    #[test]
     fn the_field_decides_where_halves_of_the_views_disagree() {
         // One view shows a part of the vessel wider than the other one. Both together would give a radius of 0.87 mm.
         let wider = |view: usize, z: f64| if view == 0 && z > -18.0 && z < -8.0 { 1.6 } else { 1.0 };

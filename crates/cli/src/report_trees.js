@@ -44,7 +44,7 @@
     if ($("tree-legend")) $("tree-legend").hidden = !$("tree-doubt").checked;
     const phase = place ? shown(place.view).phase : 0;
     const here = placeAt(phase);
-    $("tree-told").textContent = here ? `${trees.told(tree, trees.branchesAt(tree, phase), here, trees.lesionsAt(tree, phase))} (phase ${phase}).` : "Click a line.";
+    $("tree-told").textContent = here ? `${trees.branchText(tree, trees.branchesAt(tree, phase), here, trees.lesionsAt(tree, phase))} (phase ${phase}).` : "Click a line.";
     for (const row of document.querySelectorAll("tr[data-branch]")) {
       const of = placeAt(Number(row.dataset.phase));
       row.classList.toggle("chosen", of !== null && of.branch === Number(row.dataset.branch));

@@ -66,7 +66,7 @@ impl TreeSection {
     pub fn markup(&self) -> Markup {
         html! {
             h2 { "Vessels as a tree" }
-            p.lead { "Centrelines over the angiograms of the training views; " (self.note) ". " (radii_told(self.beat.radii_from)) }
+            p.lead { "Centrelines over the angiograms of the training views; " (self.note) ". " (radii_source(self.beat.radii_from)) }
             style { (PreEscaped(STYLE)) }
             noscript { p.warn { "A script of this page draws the lines, but scripts are switched off in this \
                                  browser." } }
@@ -124,7 +124,7 @@ fn view_data(dataset: &Dataset, view: usize, step: usize) -> Result<Value> {
 }
 
 /// Returns the sentence about the source of the radii.
-fn radii_told(radii_from: RadiiFrom) -> &'static str {
+fn radii_source(radii_from: RadiiFrom) -> &'static str {
     match radii_from {
         RadiiFrom::Images => "Diameters are those that the angiograms show.",
         RadiiFrom::Field => {

@@ -69,30 +69,30 @@ const trees = (() => {
   }
 
   // Returns the text about the stenoses of a branch.
-  function lesionsTold(branch, lesions) {
+  function lesionsText(branch, lesions) {
     const along = ways(branch.points_mm);
     return lesions.map(lesion => `; stenosis of ${lesion.stenosis_percent.toFixed(0)} %, ${along[lesion.point].toFixed(1)} mm from its start: `
       + `${lesion.min_diameter_mm.toFixed(2)} mm instead of ${lesion.reference_diameter_mm.toFixed(2)} mm`).join("");
   }
 
   // Returns the text about a clicked branch of a tree.
-  function told(tree, branches, place, lesions) {
+  function branchText(tree, branches, place, lesions) {
     const m = measure(branches[place.branch], place), mm = v => v.toFixed(2) + " mm";
     return `Branch ${place.branch}: ${m.length_mm.toFixed(1)} mm long; minimum diameter ${mm(m.least_mm)}, `
       + `mean ${mm(m.mean_mm)}, ${mm(m.here_mm)} at this point, ${m.along_mm.toFixed(1)} mm from its start `
       + (tree.radii_from === "images" ? "(diameters as the images show them)" : "(diameters as the field shows them)")
-      + gapTold(branches[place.branch])
-      + doubtTold(branches[place.branch], place)
-      + lesionsTold(branches[place.branch], lesions.filter(lesion => lesion.branch === place.branch));
+      + gapText(branches[place.branch])
+      + doubtText(branches[place.branch], place)
+      + lesionsText(branches[place.branch], lesions.filter(lesion => lesion.branch === place.branch));
   }
 
   // Returns the text about the gaps in a branch; nothing where there are none.
-  function gapTold({gap_mm}) {
+  function gapText({gap_mm}) {
     return gap_mm ? `; the field shows nothing over ${gap_mm.toFixed(1)} mm of it, where two vessels are linked because one points at the other` : "";
   }
 
   // Returns the text about the doubt at a place; nothing where doubt is not stated.
-  function doubtTold({doubt_mm, existence}, {from, share}) {
+  function doubtText({doubt_mm, existence}, {from, share}) {
     if (!doubt_mm) return "";
     const here = values => mix(values[from], values[from + 1], share);
     return `; known to ${here(doubt_mm).toFixed(2)} mm (68 %), exists with ${(100 * here(existence)).toFixed(0)} %`;
@@ -193,5 +193,5 @@ const trees = (() => {
       return [entry, "  "];
     }));
   }
-  return {Overlay, branchesAt, cArmProjection, colour, legend, lesionsAt, told};
+  return {Overlay, branchesAt, cArmProjection, colour, legend, lesionsAt, branchText};
 })();
