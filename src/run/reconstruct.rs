@@ -65,6 +65,8 @@ pub fn reconstruct(
     options: &RunOptions<'_>,
     observe: &mut dyn FnMut(&Event),
 ) -> Result<()> {
+    // The fits of an adjustment and those of a mean need the same pipelines.
+    let _pipelines = gpu.keep_pipelines();
     // Files that an earlier process on this run was writing when it was killed are removed.
     for directory in [options.run, &options.run.join("report")] {
         files::remove_partial(directory);

@@ -82,33 +82,94 @@ pub fn opening(image: &Image, radius: usize) -> Image {
 }
 
 /// Median over `2 radius + 1` pixels of each row, then of each column: removes structures that are narrower than half of this
-/// window in one or both directions.
+/// window in one or both directions. Values must be numbers.
 pub fn median_filter(image: &Image, radius: usize) -> Image {
-    let rows = median_of_rows(image, radius);
-    median_of_rows(&rows.transposed(), radius).transposed()
+    median_of_columns(&median_of_columns(&image.transposed(), radius).transposed(), radius)
 }
 
-/// Replaces each value by the median of its window in the row. The window is kept sorted while it moves along the row.
-fn median_of_rows(image: &Image, radius: usize) -> Image {
-    let radius = radius.min(image.width);
-    let mut sorted: Vec<f32> = Vec::with_capacity(2 * radius + 1);
-    let mut out = Image::zeros(image.width, image.height);
-    for (row, out) in image.values.chunks(image.width).zip(out.values.chunks_mut(image.width)) {
-        sorted.clear();
-        sorted.extend(&row[..radius.min(row.len())]);
-        sorted.sort_unstable_by(f32::total_cmp);
-        let place = |sorted: &[f32], value: f32| sorted.partition_point(|v| v.total_cmp(&value).is_lt());
-        for (x, out) in out.iter_mut().enumerate() {
-            if let Some(entering) = row.get(x + radius) {
-                sorted.insert(place(&sorted, *entering), *entering);
+/// Replaces each value by the median of its window in the column.
+fn median_of_columns(image: &Image, radius: usize) -> Image {
+    let (width, height) = (image.width, image.height);
+    let radius = radius.min(height);
+    let mut out = Image::zeros(width, height);
+    for first in (0..width).step_by(SortedWindows::COLUMNS) {
+        let count = SortedWindows::COLUMNS.min(width - first);
+        let row = |y: usize| {
+            let mut row = [0.0; SortedWindows::COLUMNS];
+            row[..count].copy_from_slice(&image.values[y * width + first..][..count]);
+            row
+        };
+        let mut windows = SortedWindows { rows: Vec::with_capacity(2 * radius + 1) };
+        (0..radius).for_each(|y| windows.insert(row(y)));
+        for y in 0..height {
+            let entering = (y + radius < height).then(|| row(y + radius));
+            let leaving = y.checked_sub(radius + 1).map(row);
+            match (leaving, entering) {
+                (Some(leaving), Some(entering)) => windows.replace(&leaving, entering),
+                (None, Some(entering)) => windows.insert(entering),
+                (Some(leaving), None) => windows.remove(&leaving),
+                (None, None) => {}
             }
-            if let Some(left) = x.checked_sub(radius + 1) {
-                sorted.remove(place(&sorted, row[left]));
-            }
-            *out = sorted[sorted.len() / 2];
+            out.values[y * width + first..][..count].copy_from_slice(&windows.medians()[..count]);
         }
     }
     out
+}
+
+/// Windows of neighbouring columns, each of which is kept sorted while it moves along its column. No step depends on the values, so a
+/// compiler can process several columns in one instruction.
+struct SortedWindows {
+    /// `[rank][column]`: the values of each window in ascending order.
+    rows: Vec<[f32; SortedWindows::COLUMNS]>,
+}
+
+impl SortedWindows {
+    const COLUMNS: usize = 16;
+
+    /// Adds a value to each window: at each rank the smaller one of two values stays, and the larger one moves on.
+    fn insert(&mut self, mut moving: [f32; Self::COLUMNS]) {
+        for row in &mut self.rows {
+            for (value, moving) in row.iter_mut().zip(&mut moving) {
+                (*value, *moving) = ordered(*value, *moving);
+            }
+        }
+        self.rows.push(moving);
+    }
+
+    /// Takes a value from each window, which must hold it: from its rank on, each value is replaced by the next one.
+    fn remove(&mut self, leaving: &[f32; Self::COLUMNS]) {
+        for rank in 1..self.rows.len() {
+            let next = self.rows[rank];
+            for ((value, next), leaving) in self.rows[rank - 1].iter_mut().zip(next).zip(leaving) {
+                *value = if *value < *leaving { *value } else { next };
+            }
+        }
+        self.rows.pop();
+    }
+
+    /// Removes a value and inserts another one in one pass.
+    fn replace(&mut self, leaving: &[f32; Self::COLUMNS], mut moving: [f32; Self::COLUMNS]) {
+        for rank in 1..self.rows.len() {
+            let next = self.rows[rank];
+            let columns = self.rows[rank - 1].iter_mut().zip(next).zip(leaving).zip(&mut moving);
+            for (((value, next), leaving), moving) in columns {
+                let kept = if *value < *leaving { *value } else { next };
+                (*value, *moving) = ordered(kept, *moving);
+            }
+        }
+        if let Some(last) = self.rows.last_mut() {
+            *last = moving;
+        }
+    }
+
+    fn medians(&self) -> &[f32; Self::COLUMNS] {
+        &self.rows[self.rows.len() / 2]
+    }
+}
+
+/// Returns the smaller and the larger one of two values. [`f32::min`] would check for NaN, which takes longer.
+fn ordered(a: f32, b: f32) -> (f32, f32) {
+    (if a < b { a } else { b }, if a < b { b } else { a })
 }
 
 /// Returns the middle value, or 0 if there are none. Reorders the values.
@@ -149,8 +210,9 @@ mod tests {
     }
 
     #[test]
-    fn windows_that_move_have_the_median_of_their_values() {
-        let (w, h) = (13, 7);
+    fn sorted_windows_have_the_median_of_their_values() {
+        // More than the columns that are processed at once, and no multiple of them.
+        let (w, h) = (SortedWindows::COLUMNS + 3, 7);
         let values: Vec<f32> = (0..w * h).map(|p| ((p * 37 + 11) % 17) as f32 - 8.0).collect();
         let image = Image { width: w, height: h, values };
         let of = |values: &[f32], centre: usize, radius: usize| {

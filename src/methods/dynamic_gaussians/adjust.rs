@@ -89,7 +89,8 @@ pub(super) fn adjust(task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result
     let start = stands.poses(calibration);
     let is_full_size = (coarse.width, coarse.height) == (dataset.width, dataset.height);
     let calibrated = if is_full_size { coarse.corrected(calibration)? } else { stands.at(&start) };
-    Adjuster { gpu, config, stands, evidence, is_full_size }.run(&calibrated, start, observe)
+    let motion = SoftMotion::uncarved(evidence);
+    Adjuster { gpu, config, stands, motion, is_full_size }.run(&calibrated, start, observe)
 }
 
 /// Start of a fit.
@@ -116,7 +117,8 @@ struct Adjuster<'a> {
     gpu: &'a Gpu,
     config: &'a Config,
     stands: Stands<'a>,
-    evidence: Vec<ViewEvidence>,
+    /// Evidence of the views, and the hull of the last fit that began with seeds.
+    motion: SoftMotion,
     /// Whether the images are those of the run, so that a fit to them can be the run's.
     is_full_size: bool,
 }
@@ -128,13 +130,14 @@ fn small_misfit(n_views: usize) -> f64 {
 
 impl Adjuster<'_> {
     /// Adjusts the poses of a calibrated dataset.
-    fn run(&self, calibrated: &Dataset, start: Poses, observe: &mut Observe<'_>) -> Result<Option<AdjustedFit>> {
+    fn run(mut self, calibrated: &Dataset, start: Poses, observe: &mut Observe<'_>) -> Result<Option<AdjustedFit>> {
         observe(0.0)?;
         let Some((before, made)) = self.compared(calibrated, &mut || observe(0.0))? else { return Ok(None) };
+        let (views, is_full_size) = (self.stands.views.clone(), self.is_full_size);
         let outcome = |poses: Poses, accepted: bool, after: Option<f64>, made: MadeGaussians| {
             let record = Adjustment { accepted, misfit_before: before, misfit_after: after };
-            let adjusted = Adjusted { views: self.stands.views.clone(), poses, record };
-            Ok(Some(AdjustedFit { adjusted, made: self.is_full_size.then_some(made) }))
+            let adjusted = Adjusted { views, poses, record };
+            Ok(Some(AdjustedFit { adjusted, made: is_full_size.then_some(made) }))
         };
         if before <= small_misfit(self.stands.views.len()) || before >= LARGE_MISFIT {
             return outcome(start, false, None, made);
@@ -148,7 +151,7 @@ impl Adjuster<'_> {
     }
 
     /// Finds poses in cycles of a fit and a step of the poses.
-    fn found(&self, start: Poses, observe: &mut Observe<'_>) -> Result<Option<Poses>> {
+    fn found(&mut self, start: Poses, observe: &mut Observe<'_>) -> Result<Option<Poses>> {
         let (mut poses, mut number) = (start, 0);
         let mut earlier: Option<DeformableGaussians> = None;
         for stage in &STAGES {
@@ -197,7 +200,7 @@ impl Adjuster<'_> {
 
     /// Fits with the settings of the run; returns the misfit and the fit.
     fn compared(
-        &self,
+        &mut self,
         dataset: &Dataset,
         proceed: &mut dyn FnMut() -> Result<()>,
     ) -> Result<Option<(f64, MadeGaussians)>> {
@@ -211,7 +214,7 @@ impl Adjuster<'_> {
 
     /// Fits a deformable set; none where the data do not ask for one. `proceed` is called before every few iterations.
     fn fit(
-        &self,
+        &mut self,
         dataset: &Dataset,
         config: &Config,
         start: Start<'_>,
@@ -219,9 +222,10 @@ impl Adjuster<'_> {
     ) -> Result<Option<Fitted>> {
         proceed()?;
         let (config, from) = (&start.iterations(config), carried_step(&config.gaussians));
-        let half = dynamic_half(config, dataset);
-        let motion = SoftMotion::carved(self.evidence.clone(), dataset, half, SOFT_HULL_CELLS);
-        let targets = match Targets::new(dataset, &motion, &config.gaussians) {
+        if start.is_seeded() {
+            self.motion.carve(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
+        }
+        let targets = match Targets::new(dataset, &self.motion, &config.gaussians) {
             // The plan of the run tells what is missing.
             Err(Error::Config { .. }) => return Ok(None),
             targets => targets?,
@@ -248,6 +252,11 @@ impl Adjuster<'_> {
 }
 
 impl Start<'_> {
+    /// Tells whether seeds are placed in the hull.
+    fn is_seeded(self) -> bool {
+        !matches!(self, Start::Earlier(_))
+    }
+
     /// Returns settings with the number of iterations of such a fit.
     fn iterations(self, config: &Config) -> Config {
         let mut config = config.clone();

@@ -385,14 +385,18 @@ impl DeformableTrainer {
     fn grow(&mut self) -> Result<()> {
         let (weakest, setup) = (self.config.gaussians.prune_threshold, self.joint.setup);
         let mut members = self.retain(|rows| strong(rows, &setup, weakest))?;
+        let settings = self.targets.lengths.gaussians(&self.config.gaussians);
+        if seeds::n_additions(&settings) == 0 {
+            return Ok(());
+        }
         let deformable = self.deformable()?;
         let carried = |x: DVec3, phase: f64| deformable.carried(x, phase);
         let is_filled = |x: DVec3, phase: usize| {
             deformable.filling.is_none() || deformable.filling_at(deformable.nearest(x), phase) >= MOSTLY_FILLED
         };
-        let (settings, seed) = (self.targets.lengths.gaussians(&self.config.gaussians), self.config.seed);
+        let images = self.images()?;
         let additions =
-            seeds::deformable_additions(&self.targets, &settings, seed, &self.images()?, carried, is_filled);
+            seeds::deformable_additions(&self.targets, &settings, self.config.seed, &images, carried, is_filled);
         members.append(additions, &deformable);
         self.replace(&members)
     }

@@ -72,11 +72,16 @@ pub fn first_density(targets: &Targets, images: &[f32]) -> f64 {
     if shown > 0.0 && wanted > 0.0 { wanted / shown } else { 1.0 }
 }
 
+/// Returns the number of new Gaussians of a phase.
+pub fn n_additions(settings: &sections::Gaussians) -> usize {
+    (settings.grow_share * f64::from(settings.count)) as usize
+}
+
 /// New Gaussians at places of the hull where every view lacks line integral. `images` are those of the present field,
 /// `[image][pixel]`.
 pub fn additions(targets: &Targets, settings: &sections::Gaussians, seed: u32, images: &[f32]) -> Vec<Gaussian> {
     let missing = missing_images(targets, images);
-    let count = (settings.grow_share * f64::from(settings.count)) as usize;
+    let count = n_additions(settings);
     let mut all = Vec::new();
     for (phase, places) in targets.places.iter().enumerate() {
         let weights: Vec<f64> =
@@ -98,7 +103,7 @@ pub fn deformable_additions(
     is_filled: impl Fn(DVec3, usize) -> bool,
 ) -> Vec<Gaussian> {
     let missing = missing_images(targets, images);
-    let count = (settings.grow_share * f64::from(settings.count)) as usize;
+    let count = n_additions(settings);
     let places = &targets.places[targets.rest_phase];
     let weight = |place: &PossibleVessel| {
         let at =

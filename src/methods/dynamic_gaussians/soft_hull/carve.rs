@@ -66,13 +66,20 @@ impl SoftMotion {
             true => views.into_iter().map(evidence).collect(),
             false => views.into_par_iter().map(evidence).collect(),
         };
-        SoftMotion::carved(views, dataset, half, resolution)
+        let mut motion = SoftMotion::uncarved(views);
+        motion.carve(dataset, half, resolution);
+        motion
     }
 
-    /// Carves by evidence that is known already.
-    pub fn carved(views: Vec<ViewEvidence>, dataset: &Dataset, half: f64, resolution: usize) -> SoftMotion {
-        let hull = SoftHull::carve(dataset, &views, half, resolution.next_multiple_of(2));
+    /// Takes evidence that is known already, with a hull that has no cells until [`SoftMotion::carve`].
+    pub fn uncarved(views: Vec<ViewEvidence>) -> SoftMotion {
+        let hull = SoftHull { resolution: 0, min: DVec3::ZERO, cell: 0.0, cells: Vec::new() };
         SoftMotion { views, hull }
+    }
+
+    /// Carves the hull anew, by the evidence and the geometry of a dataset.
+    pub fn carve(&mut self, dataset: &Dataset, half: f64, resolution: usize) {
+        self.hull = SoftHull::carve(dataset, &self.views, half, resolution.next_multiple_of(2));
     }
 }
 
