@@ -78,15 +78,38 @@ fn a_haze_behind_blades_is_no_vessel() {
         program().args(["train", text(&data), "-o", text(&run), "--seed", "4", "--stop-at", "130"]).output().unwrap();
     let told = String::from_utf8_lossy(&trained.stderr);
     assert!(trained.status.success(), "{told}");
-    for fit in 1..=3 {
-        let left_out = format!(
-            "fit {fit} of 3: Gaussians that are left out, because they are broader than the vessels and hidden"
-        );
-        assert!(told.contains(&left_out), "{told}");
-    }
+    // What the first fit finds is stated as well as what the last one finds.
+    let left_out = "fit 1 of 3: Gaussians that are left out, because they are broader than the vessels and hidden";
+    assert!(told.contains(left_out), "{told}");
     let dice = read(&run.join("report/evaluation.json"))["dice"]["dynamic"].as_f64().unwrap();
     println!("Dice {dice:.3}");
     assert!(dice > 0.74, "{dice}");
+}
+
+/// A catheter that all training views show, and no unseen view: Dice is .84 with it and .95 without it.
+#[test]
+#[ignore = "long: tools/test --all"]
+fn a_catheter_is_left_out_on_request() {
+    let Some(anatomy) = shared::shared("anatomy") else { return };
+    let tree = anatomy.join("coronary_tree_hra.json");
+    let directory = tempfile::tempdir().unwrap();
+    let data = directory.path().join("data");
+    nertca(&["phantom", text(&data), "--tree", text(&tree), "--catheter", "--seed", "1", "--no-volumes"]);
+    let trained = |without: bool| {
+        let run = directory.path().join(without.to_string());
+        let setting = format!("gaussians.without_catheter={without}");
+        let args = ["train", text(&data), "-o", text(&run), "--seed", "1", "--stop-at", "130", "--set", &setting];
+        let out = program().args(args).output().unwrap();
+        let said = String::from_utf8_lossy(&out.stderr).into_owned();
+        assert!(out.status.success(), "{said}");
+        (read(&run.join("report/evaluation.json"))["dice"]["dynamic"].as_f64().unwrap(), said)
+    };
+    let [(with, found), (without, left_out)] = [false, true].map(trained);
+    println!("with the catheter: Dice {with:.3}, without: {without:.3}");
+    assert!(found.contains("a catheter seems to be in the dynamic field"), "{found}");
+    assert!(found.contains("--set gaussians.without_catheter=true leaves it out"), "{found}");
+    assert!(left_out.contains("it is left out (gaussians.without_catheter)"), "{left_out}");
+    assert!(with < 0.88 && without > 0.93, "with the catheter {with}, without {without}");
 }
 
 #[test]
