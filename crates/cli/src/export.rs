@@ -21,7 +21,7 @@ use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::scan::writer::convert as convert_dataset;
 use nertca_vk::vessels::threshold::vessel_threshold_per_mm;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Arguments of `export`.
 #[derive(Debug, Args)]
@@ -155,7 +155,7 @@ pub fn export(global: &GlobalOptions, args: &ExportArgs) -> Result<()> {
             // The static background is the same at every phase.
             sequence: all && args.component.has_dynamic(),
             phases: if args.component.has_dynamic() { phases } else { vec![0] },
-            format: format.ok_or_else(|| unknown(".nrrd .nii .nii.gz .mha .npy .vtk; choose one with --format"))?,
+            format: format.ok_or_else(|| no_volume(&args.out))?,
             compression: if compressed { Compression::Gzip } else { Compression::None },
         };
         let earlier = earlier(args, export.format == Format::Vtk && export.sequence)?;
@@ -246,6 +246,19 @@ fn export_splats(args: &ExportArgs, model: &Model, phases: &[u32]) -> Result<()>
     Ok(())
 }
 
+/// Returns the error for a file whose name does not end as those of volumes do. It names the option for other endings.
+fn no_volume(out: &Path) -> Error {
+    let end = out.extension().and_then(|end| end.to_str()).unwrap_or_default().to_ascii_lowercase();
+    let advice = match end.as_str() {
+        "dcm" => "add --segmentation for DICOM segmentations",
+        "ply" => "add --mesh for surfaces or --splats for Gaussians",
+        "stl" | "obj" | "glb" => "add --mesh for surfaces",
+        _ => "choose one with --format",
+    };
+    let problem = format!("does not end in one of .nrrd .nii .nii.gz .mha .npy .vtk, as volumes do; {advice}");
+    Error::config("--out", out.display(), problem)
+}
+
 /// Exports displacements, or the paths of the Gaussians; needs no device.
 fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: bool) -> Result<()> {
     let tree = deformable_set(model)?;
@@ -292,4 +305,19 @@ pub fn convert(args: &ConvertArgs) -> Result<()> {
     })?;
     out!("{}", args.out.display());
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn endings_of_other_exports_name_their_option() {
+        let options = [("v.dcm", "--segmentation"), ("v.PLY", "--splats"), ("v.glb", "--mesh"), ("v.xyz", "--format")];
+        for (name, option) in options {
+            let said = no_volume(Path::new(name)).to_string();
+            assert!(said.contains(name) && said.contains(option), "{said}");
+        }
+        assert!(!no_volume(Path::new("v.dcm")).to_string().contains("--format"));
+    }
 }
