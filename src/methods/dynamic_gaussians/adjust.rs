@@ -117,7 +117,8 @@ struct Adjuster<'a> {
     gpu: &'a Gpu,
     config: &'a Config,
     stands: Stands<'a>,
-    /// Evidence of the views, and the hull of the last fit that began with seeds.
+    /// Evidence of the views, and the hull of the last fit that began with seeds. It also determines the
+    /// extent of the motion grid, which the fits that go on from that one keep.
     motion: SoftMotion,
     /// Whether the images are those of the run, so that a fit to them can be the run's.
     is_full_size: bool,
