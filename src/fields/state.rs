@@ -3,7 +3,6 @@
 use crate::config::{Config, StaticForm};
 use crate::error::{Error, Result};
 use crate::fitting::fit::{FitField, FitState, PendingFit, SavedAt, SavedFit};
-use crate::fitting::losses::SMALLER_STEPS;
 use crate::gaussians::field::DynamicGaussians;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
@@ -199,6 +198,8 @@ pub(crate) struct PendingFields {
     pub(super) occupancy: Buffer,
     pub(super) occupancy_words: usize,
     pub(super) scaled: bool,
+    /// Advice for a run that diverged.
+    pub(super) advice: &'static str,
 }
 
 impl PendingFit for PendingFields {
@@ -208,7 +209,7 @@ impl PendingFit for PendingFields {
         self.params.read(&mut params)?;
         if let Some(bad) = params.iter().find(|p| !p.is_finite()) {
             let (step, value) = (u64::from(self.step), f64::from(*bad));
-            return Err(Error::Diverged { step, quantity: "parameter", value, advice: SMALLER_STEPS });
+            return Err(Error::Diverged { step, quantity: "parameter", value, advice: self.advice });
         }
         let mut moments = vec![[0f32; 2]; self.n_params];
         self.moments.read(&mut moments)?;

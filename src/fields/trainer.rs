@@ -11,7 +11,7 @@ use crate::fields::step::{TrainingBuffers, clear, forward_buffers, record_step};
 use crate::fitting::RING_LENGTH;
 use crate::fitting::fit::{Beginning, FieldFeed, Fit, FitData, FitField, FitStart, PendingFit, SavedFit, TimedFit};
 use crate::fitting::ledger::{Ledger, StageWork, add};
-use crate::fitting::losses::{NetworkLosses, StepLoss};
+use crate::fitting::losses::{NetworkLosses, SMALLER_STEPS, SMALLER_STEPS_WITH_A_NETWORK, StepLoss};
 use crate::fitting::ring::tells_nothing;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
@@ -353,6 +353,7 @@ impl FieldsFit {
             occupancy,
             occupancy_words: occupancy_bytes(setup) as usize / 4,
             scaled: layers_of(self.network.as_ref()) == Layers::Matrices,
+            advice: if self.network.is_some() { SMALLER_STEPS_WITH_A_NETWORK } else { SMALLER_STEPS },
         })
     }
 }

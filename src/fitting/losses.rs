@@ -88,8 +88,10 @@ impl StepLoss {
 
 /// Multiple of the first loss at which a warning is issued.
 const LARGE: f64 = 1e6;
-/// Settings that make the steps of ray-marched fields smaller.
-pub(crate) const SMALLER_STEPS: &str = "a lower static.lr or dynamic.lr, or a longer dynamic.delay";
+/// Settings that make the steps of a static tensor field smaller.
+pub(crate) const SMALLER_STEPS: &str = "a lower static.lr";
+/// Settings that make the steps of ray-marched fields smaller where the dynamic one is a network.
+pub(crate) const SMALLER_STEPS_WITH_A_NETWORK: &str = "a lower static.lr or dynamic.lr";
 
 /// A loss far above the first one. With the published learning rates, such a loss occurs when the dynamic field starts, and
 /// training continues.

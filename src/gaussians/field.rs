@@ -8,9 +8,9 @@ use glam::DVec3;
 use serde::Serialize;
 use std::sync::{Arc, Mutex};
 
-/// Settings that make the steps of a fit smaller.
-pub const SMALLER_STEPS: &str = "lower learning rates in section `gaussians`: gaussians.position_rate, \
-                                 gaussians.scale_rate, gaussians.rotation_rate, gaussians.density_rate";
+/// Advice for a fit that diverged. Its rates are constants of the program.
+pub const AGAINST_DIVERGENCE: &str = "`nertca-vk check`, which tells whether the views disagree, then another seed or a \
+                                      lower gaussians.count";
 
 /// Units of Gaussians, for conversion from and to world units and line integrals.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -88,7 +88,7 @@ impl Gaussians {
             Some(bad) => {
                 let step = u64::from(self.step);
                 let (quantity, value) = ("a parameter of a Gaussian", f64::from(bad));
-                Err(Error::Diverged { step, quantity, value, advice: SMALLER_STEPS })
+                Err(Error::Diverged { step, quantity, value, advice: AGAINST_DIVERGENCE })
             }
             None => Ok(()),
         }

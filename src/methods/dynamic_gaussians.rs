@@ -49,7 +49,7 @@ use crate::fitting::fit::{
     TimedFit,
 };
 use crate::gaussians::blobs::BlobKernels;
-use crate::gaussians::field::SMALLER_STEPS;
+use crate::gaussians::field::AGAINST_DIVERGENCE;
 use crate::gaussians::pictures::into_buffers;
 use crate::gaussians::stages::GaussianKernels;
 use crate::gaussians::tensors::{self, FORMAT};
@@ -109,7 +109,7 @@ impl Method for DynamicGaussiansMethod {
     }
 
     fn smaller_steps(&self) -> &'static str {
-        SMALLER_STEPS
+        AGAINST_DIVERGENCE
     }
 
     fn make_pipelines(&self, gpu: &Gpu, config: &Config, tuning: &Tuning) -> Result<()> {

@@ -13,7 +13,6 @@ use crate::fields::motion;
 use crate::fields::state;
 use crate::fitting::extent::between_phases;
 use crate::fitting::fit::{Method, PlannedFit, SavedAt, SavedFit};
-use crate::fitting::losses::SMALLER_STEPS;
 use crate::gpu::device::Gpu;
 use crate::kernels::stages::StaticNetworkKernels;
 use crate::kernels::tuning::Tuning;
@@ -60,7 +59,7 @@ impl Method for NerfCa {
     }
 
     fn smaller_steps(&self) -> &'static str {
-        SMALLER_STEPS
+        "a lower static.lr or dynamic.lr, or a longer networks.delay"
     }
 
     fn make_pipelines(&self, gpu: &Gpu, _: &Config, _: &Tuning) -> Result<()> {

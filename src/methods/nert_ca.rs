@@ -13,7 +13,6 @@ use crate::fields::scale::dynamic_half;
 use crate::fields::state;
 use crate::fitting::extent::between_phases;
 use crate::fitting::fit::{Method, PlannedFit, SavedAt, SavedFit};
-use crate::fitting::losses::SMALLER_STEPS;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
 use crate::model::hull::Hull;
@@ -57,7 +56,7 @@ impl Method for NertCa {
     }
 
     fn smaller_steps(&self) -> &'static str {
-        SMALLER_STEPS
+        "a lower static.lr or dynamic.lr, or a longer dynamic.delay"
     }
 
     fn make_pipelines(&self, _: &Gpu, _: &Config, _: &Tuning) -> Result<()> {
@@ -82,7 +81,7 @@ fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes:
         None
     } else if share > config.hull.max_share {
         notes.push(format!(
-            "the motion hull is not used: it would keep {:.0} % of the box, and hull.max_share is {:.0} %",
+            "the motion hull is not used: it would keep {:.0} % of the box, and more than {:.0} % saves nothing",
             100.0 * share,
             100.0 * config.hull.max_share
         ));

@@ -27,6 +27,7 @@ mod image_sizes;
 mod kept_pipelines;
 mod kernels_vs_cpu;
 mod live_pictures;
+mod messages;
 mod networks;
 mod phantom_settings;
 mod projector;

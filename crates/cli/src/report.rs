@@ -133,8 +133,8 @@ impl Report<'_> {
         }
         if let Some(hull) = model.hull.as_ref().filter(|h| h.share() < 5e-5) {
             warnings.push(format!(
-                "The motion hull keeps only {:.4} % of the box, so the views hardly agree. Check geometry and phases, \
-                 or raise hull.dilate_pixels.",
+                "The motion hull keeps only {:.4} % of the box, so the views hardly agree. Check geometry and phases \
+                 (`nertca-vk check`).",
                 100.0 * hull.share()
             ));
         }

@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::evidence::series::blur;
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::ring::{losses, ring};
-use crate::gaussians::field::{DeformableGaussians, Gaussians, SMALLER_STEPS, dense};
+use crate::gaussians::field::{AGAINST_DIVERGENCE, DeformableGaussians, Gaussians, dense};
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers};
 use crate::gaussians::view::SplatView;
@@ -363,7 +363,7 @@ impl DeformableTrainer {
         if self.step == self.config.gaussians.iterations && self.members.filling.is_some() {
             self.complete_motion(None)?;
         }
-        losses(&self.gpu, &self.joint.targets.gaussian_ring, first..self.step, SMALLER_STEPS)
+        losses(&self.gpu, &self.joint.targets.gaussian_ring, first..self.step, AGAINST_DIVERGENCE)
     }
 
     /// Estimates the static background anew from what the Gaussians leave of the images, and with it the bounds of the fit's targets.
@@ -563,12 +563,7 @@ impl DeformableTrainer {
         if let Some(bad) = grid.iter().chain(&own).flatten().find(|v| !v.is_finite()) {
             let step = u64::from(self.step);
             let (quantity, value) = ("the motion of the deformable set", f64::from(*bad));
-            return Err(Error::Diverged {
-                step,
-                quantity,
-                value,
-                advice: "a lower deformable.grid_rate and deformable.own_rate",
-            });
+            return Err(Error::Diverged { step, quantity, value, advice: AGAINST_DIVERGENCE });
         }
         let rest = Gaussians {
             units: self.targets.units,

@@ -4,7 +4,7 @@ use crate::config::{Config, sections};
 use crate::error::{Error, Result};
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::ring::losses;
-use crate::gaussians::field::{Gaussians, SMALLER_STEPS, amplitude, dense};
+use crate::gaussians::field::{AGAINST_DIVERGENCE, Gaussians, amplitude, dense};
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers, record_images, record_step};
 use crate::gaussians::work::{GaussianWork, SplatCost};
@@ -141,7 +141,7 @@ impl GaussianTrainer {
         if setup::parts_from_strays(&self.settings, self.step) {
             self.drop_strays()?;
         }
-        losses(&self.gpu, &self.part.buffers.gaussian_ring, first..self.step, SMALLER_STEPS)
+        losses(&self.gpu, &self.part.buffers.gaussian_ring, first..self.step, AGAINST_DIVERGENCE)
     }
 
     /// Estimates the static background anew from what the Gaussians leave of the images, and with it the bounds of the

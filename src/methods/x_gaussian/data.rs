@@ -90,7 +90,7 @@ impl XData {
         let extent_mm = if settings.extent_mm > 0.0 { settings.extent_mm } else { extent_of(&views) };
         if extent_mm <= 0.0 {
             let problem = "the extent of the scene cannot be computed, because all views have the same source \
-                           position: set it, in mm";
+                           position: it needs views from different directions";
             return Err(Error::unmet("x.extent_mm", settings.extent_mm, problem));
         }
         Ok(XData {
