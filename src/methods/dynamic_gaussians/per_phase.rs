@@ -256,8 +256,8 @@ pub(super) fn strong(rows: &[Gaussian], setup: &GaussianSetup, weakest: f64) -> 
 pub(super) fn check_count(particles: &Particles) -> Result<u32> {
     let n = particles.rows.len();
     if n == 0 {
-        let problem = "no Gaussian is left: there is no motion in the images, or the pruning threshold \
-                       gaussians.prune_threshold is too high";
+        let problem =
+            "no Gaussian is left: there is no motion in the images; `nertca-vk check` shows what they contain";
         return Err(Error::unmet("gaussians.count", n, problem));
     }
     u32::try_from(n).map_err(|_| Error::config("gaussians.count", n, "is too many Gaussians"))

@@ -38,7 +38,7 @@ fn places(data: &R2Data, settings: &R2, seed: u32, set: usize) -> (Vec<(DVec3, f
         let name = data.sets.name(set);
         let note = format!(
             "the back-projection of {name} is above {} at {} voxels, and {count} Gaussians are to begin there: they begin \
-             anywhere (r2.n_points, r2.voxels, r2.density_thresh; r2.init = \"random\" does so without asking)",
+             anywhere; a lower r2.n_points or a larger r2.voxels lets them begin there",
             settings.candidate,
             candidates.len()
         );
