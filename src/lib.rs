@@ -14,8 +14,8 @@
 //! 6. [`render`]: any pose and phase -> projections and samples of the fields
 //! 7. [`export`] writes them for other tools, [`score`] compares them with the images, [`trees`] extracts centrelines from them
 //!
-//! [`run`] connects these to a run directory, [`session`] is a reconstruction in memory to which frames can be added, and
-//! [`capi`] is its C interface. [`phantom`] makes synthetic data, [`mod@bench`] measures the speed, and [`mod@reference`] holds an f64 reference of every compute stage, with which tests and `selftest`
+//! [`run`] connects these to a run directory, and [`session`] is a reconstruction in memory to which frames can be added, of which
+//! the crate `nertca-vk-abi` is the C interface. [`phantom`] makes synthetic data, [`mod@bench`] measures the speed, and [`mod@reference`] holds an f64 reference of every compute stage, with which tests and `selftest`
 //! compare the device; `inventory` lists pipelines as drivers compile them (both belong to the feature `diagnostics`). All of
 //! them build on the compute stages in [`kernels`] and on two crates that know nothing of angiography: [`gpu`], Vulkan compute, and
 //! [`formats`], files that other tools read and write. A module
@@ -327,28 +327,6 @@ pub mod run {
 }
 
 pub mod session;
-
-/// The C ABI: `include/nertca_vk.h` is generated from here.
-#[allow(non_camel_case_types, reason = "types have the names they have in C")]
-#[allow(unreachable_pub, reason = "what the modules share among themselves")]
-pub mod capi {
-    pub mod boundary;
-    pub mod calibration;
-    mod callsites;
-    pub mod context;
-    pub mod handles;
-    pub mod log;
-    pub mod options;
-    pub mod output;
-    pub mod reconstruction;
-    pub mod semaphores;
-    mod shared_memory;
-    pub mod status;
-    pub mod training;
-    pub mod tree;
-    pub mod truth;
-    pub mod types;
-}
 
 pub mod bench;
 

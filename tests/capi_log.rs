@@ -7,9 +7,9 @@
 mod c_scene;
 
 use c_scene::ok;
-use nertca_vk::capi::context::*;
-use nertca_vk::capi::log::NERTCA_LOG_WARNING;
-use nertca_vk::capi::types::*;
+use nertca_vk_abi::context::*;
+use nertca_vk_abi::log::NERTCA_LOG_WARNING;
+use nertca_vk_abi::types::*;
 use std::ffi::{CStr, c_char, c_void};
 use std::ptr::null_mut;
 use std::sync::{Barrier, Mutex};

@@ -45,7 +45,7 @@ fn the_header_is_generated() {
         "truth",
     ];
     let builder = sources.iter().fold(cbindgen::Builder::new().with_config(config), |builder, name| {
-        builder.with_src(root().join(format!("src/capi/{name}.rs")))
+        builder.with_src(root().join(format!("crates/capi/src/{name}.rs")))
     });
     builder.generate().unwrap().write(&mut header);
     expect_file("include/nertca_vk.h", &String::from_utf8(header).unwrap());

@@ -3,11 +3,11 @@
 
 use crate::c_scene::*;
 use ash::vk::{self, Handle};
-use nertca_vk::capi::context::*;
-use nertca_vk::capi::output::*;
-use nertca_vk::capi::semaphores::*;
-use nertca_vk::capi::status::*;
-use nertca_vk::capi::types::*;
+use nertca_vk_abi::context::*;
+use nertca_vk_abi::output::*;
+use nertca_vk_abi::semaphores::*;
+use nertca_vk_abi::status::*;
+use nertca_vk_abi::types::*;
 use std::ffi::{CString, c_void};
 use std::ptr::{null, null_mut};
 use std::sync::atomic::{AtomicI64, Ordering};

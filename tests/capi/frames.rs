@@ -2,15 +2,15 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
 use crate::c_scene::*;
-use nertca_vk::capi::calibration::*;
-use nertca_vk::capi::output::*;
-use nertca_vk::capi::reconstruction::*;
-use nertca_vk::capi::status::*;
-use nertca_vk::capi::training::*;
-use nertca_vk::capi::types::*;
 use nertca_vk::formats::npy;
 use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::scan::dataset::Dataset;
+use nertca_vk_abi::calibration::*;
+use nertca_vk_abi::output::*;
+use nertca_vk_abi::reconstruction::*;
+use nertca_vk_abi::status::*;
+use nertca_vk_abi::training::*;
+use nertca_vk_abi::types::*;
 use std::ffi::CStr;
 use std::ptr::{null, null_mut};
 use std::time::Duration;

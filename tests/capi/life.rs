@@ -2,15 +2,15 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
 use crate::c_scene::*;
-use nertca_vk::capi::calibration::*;
-use nertca_vk::capi::context::*;
-use nertca_vk::capi::output::*;
-use nertca_vk::capi::reconstruction::*;
-use nertca_vk::capi::status::*;
-use nertca_vk::capi::training::*;
-use nertca_vk::capi::truth::*;
-use nertca_vk::capi::types::*;
 use nertca_vk::scan::gating::{SYSTOLE_S, SYSTOLE_SHARE};
+use nertca_vk_abi::calibration::*;
+use nertca_vk_abi::context::*;
+use nertca_vk_abi::output::*;
+use nertca_vk_abi::reconstruction::*;
+use nertca_vk_abi::status::*;
+use nertca_vk_abi::training::*;
+use nertca_vk_abi::truth::*;
+use nertca_vk_abi::types::*;
 use std::ffi::{CString, c_char, c_void};
 use std::ptr::{null, null_mut};
 use std::sync::atomic::{AtomicU32, Ordering};

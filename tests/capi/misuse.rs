@@ -3,17 +3,17 @@
 
 use crate::c_scene::*;
 use crate::root::root;
-use nertca_vk::capi::boundary::nertca_last_error;
-use nertca_vk::capi::calibration::*;
-use nertca_vk::capi::context::*;
-use nertca_vk::capi::output::*;
-use nertca_vk::capi::reconstruction::*;
-use nertca_vk::capi::semaphores::*;
-use nertca_vk::capi::status::*;
-use nertca_vk::capi::training::*;
-use nertca_vk::capi::tree::*;
-use nertca_vk::capi::truth::*;
-use nertca_vk::capi::types::*;
+use nertca_vk_abi::boundary::nertca_last_error;
+use nertca_vk_abi::calibration::*;
+use nertca_vk_abi::context::*;
+use nertca_vk_abi::output::*;
+use nertca_vk_abi::reconstruction::*;
+use nertca_vk_abi::semaphores::*;
+use nertca_vk_abi::status::*;
+use nertca_vk_abi::training::*;
+use nertca_vk_abi::tree::*;
+use nertca_vk_abi::truth::*;
+use nertca_vk_abi::types::*;
 use std::cell::RefCell;
 use std::collections::BTreeSet;
 use std::ffi::{CString, c_char, c_void};

@@ -9,10 +9,6 @@
 
 use crate::c_scene::{close, context, last_error, ok, reconstruction, zeroed};
 use crate::known_tree::{ok as runs, phantom, text};
-use nertca_vk::capi::reconstruction::*;
-use nertca_vk::capi::status::*;
-use nertca_vk::capi::truth::*;
-use nertca_vk::capi::types::*;
 use nertca_vk::checkpoint;
 use nertca_vk::formats::volume::VolumeHints;
 use nertca_vk::formats::volume_files;
@@ -20,6 +16,10 @@ use nertca_vk::geometry::Geometry;
 use nertca_vk::phantom::tree_file::{TREE, TreeFile};
 use nertca_vk::scan::dataset::{Dataset, Split};
 use nertca_vk::score::volume::{VOLUMES, truth_file};
+use nertca_vk_abi::reconstruction::*;
+use nertca_vk_abi::status::*;
+use nertca_vk_abi::truth::*;
+use nertca_vk_abi::types::*;
 use serde_json::Value;
 use std::ffi::CString;
 use std::path::Path;

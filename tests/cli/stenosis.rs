@@ -4,12 +4,12 @@
 
 use crate::program::program;
 use crate::tree_pages::{Server, python_test};
-use nertca_vk::capi::context::*;
-use nertca_vk::capi::reconstruction::*;
-use nertca_vk::capi::status::{NERTCA_ERROR_ARGUMENT, NERTCA_ERROR_NOT_READY, NERTCA_OK};
-use nertca_vk::capi::tree::{nertca_reconstruction_lesion, nertca_reconstruction_tree};
-use nertca_vk::capi::types::{nertca_lesion, nertca_log, nertca_tree};
 use nertca_vk::checkpoint;
+use nertca_vk_abi::context::*;
+use nertca_vk_abi::reconstruction::*;
+use nertca_vk_abi::status::{NERTCA_ERROR_ARGUMENT, NERTCA_ERROR_NOT_READY, NERTCA_OK};
+use nertca_vk_abi::tree::{nertca_reconstruction_lesion, nertca_reconstruction_tree};
+use nertca_vk_abi::types::{nertca_lesion, nertca_log, nertca_tree};
 use serde_json::Value;
 use std::ffi::CString;
 use std::path::Path;

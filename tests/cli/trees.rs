@@ -5,13 +5,13 @@
 use crate::known_tree::{PHASES, POINTS, Trained, nertca, ok, text, train, trained};
 use crate::program::whole_config;
 use crate::python::python;
-use nertca_vk::capi::context::*;
-use nertca_vk::capi::reconstruction::*;
-use nertca_vk::capi::status::{NERTCA_ERROR_BUFFER, NERTCA_OK};
-use nertca_vk::capi::tree::nertca_reconstruction_tree;
-use nertca_vk::capi::types::{nertca_log, nertca_tree};
 use nertca_vk::checkpoint;
 use nertca_vk::config::Preset;
+use nertca_vk_abi::context::*;
+use nertca_vk_abi::reconstruction::*;
+use nertca_vk_abi::status::{NERTCA_ERROR_BUFFER, NERTCA_OK};
+use nertca_vk_abi::tree::nertca_reconstruction_tree;
+use nertca_vk_abi::types::{nertca_log, nertca_tree};
 use serde_json::{Value, json};
 use std::ffi::CString;
 use std::path::Path;

@@ -35,8 +35,7 @@ fn build_library() -> PathBuf {
 pub fn library_directory(scratch: &Path) -> PathBuf {
     let directory = scratch.join("lib");
     std::fs::create_dir_all(&directory).unwrap();
-    for name in
-        ["libnertca_vk.so".to_owned(), format!("libnertca_vk.so.{}", nertca_vk::capi::types::NERTCA_ABI_VERSION)]
+    for name in ["libnertca_vk.so".to_owned(), format!("libnertca_vk.so.{}", nertca_vk_abi::types::NERTCA_ABI_VERSION)]
     {
         let link = directory.join(name);
         if !link.exists() {

@@ -2,13 +2,13 @@
 #![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 #![allow(clippy::missing_safety_doc, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
-use nertca_vk::capi::boundary::nertca_last_error;
-use nertca_vk::capi::context::*;
-use nertca_vk::capi::output::*;
-use nertca_vk::capi::reconstruction::*;
-use nertca_vk::capi::status::*;
-use nertca_vk::capi::training::*;
-use nertca_vk::capi::types::*;
+use nertca_vk_abi::boundary::nertca_last_error;
+use nertca_vk_abi::context::*;
+use nertca_vk_abi::output::*;
+use nertca_vk_abi::reconstruction::*;
+use nertca_vk_abi::status::*;
+use nertca_vk_abi::training::*;
+use nertca_vk_abi::types::*;
 use std::ffi::{CStr, CString, c_void};
 use std::ptr::{null, null_mut};
 

@@ -1,5 +1,19 @@
-//! The C library. Its functions are those of [`nertca_vk::capi`], where each is documented; `include/nertca_vk.h` is generated from
-//! there. This crate makes the shared and the static library of them, so that neither the program nor the tests of the engine build
-//! and link these large files.
+//! The C ABI: `include/nertca_vk.h` is generated from here. The crate in `library` makes the shared and the static library of it.
+#![allow(non_camel_case_types, reason = "types have the names they have in C")]
 
-pub use nertca_vk::capi::*;
+pub mod boundary;
+pub mod calibration;
+mod callsites;
+pub mod context;
+pub mod handles;
+pub mod log;
+pub mod options;
+pub mod output;
+pub mod reconstruction;
+pub mod semaphores;
+mod shared_memory;
+pub mod status;
+pub mod training;
+pub mod tree;
+pub mod truth;
+pub mod types;

@@ -1,6 +1,6 @@
 //! Options as text, so that new options never change the ABI: lines of `key = value`, or a JSON object.
 
-use crate::capi::status::{Failure, Outcome};
+use crate::status::{Failure, Outcome};
 use std::ffi::{CStr, c_char};
 
 /// Options in the order in which they were given.

@@ -1,6 +1,6 @@
 //! Status codes and failures of calls.
 
-use crate::error::Error;
+use nertca_vk::error::Error;
 use std::ffi::c_char;
 
 /// Result of a call: 0 for success, negative for an error whose text `nertca_last_error` returns.
@@ -56,8 +56,8 @@ impl Failure {
     }
 }
 
-impl From<crate::gpu::error::Error> for Failure {
-    fn from(error: crate::gpu::error::Error) -> Failure {
+impl From<nertca_vk::gpu::error::Error> for Failure {
+    fn from(error: nertca_vk::gpu::error::Error) -> Failure {
         Error::from(error).into()
     }
 }
@@ -75,7 +75,8 @@ impl From<Error> for Failure {
             Error::Interrupted => NERTCA_ERROR_CANCELLED,
             Error::Busy(_) => NERTCA_ERROR_BUSY,
             Error::NotReady(_) | Error::Unmet { .. } => NERTCA_ERROR_NOT_READY,
-            Error::Internal(_) => NERTCA_ERROR_INTERNAL,
+            // `Error::Internal`, and variants that have no status of their own.
+            _ => NERTCA_ERROR_INTERNAL,
         };
         Failure::new(status, error.to_string())
     }

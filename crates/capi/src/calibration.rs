@@ -1,12 +1,12 @@
 //! Corrections by calibration, and better geometry for frames that were added earlier.
 
-use crate::calibrate::choose::Correction;
-use crate::capi::reconstruction::{nertca_reconstruction, on_reconstruction};
-use crate::capi::status::{Outcome, nertca_status};
-use crate::capi::types::{nertca_correction, nertca_geometry, read, write};
-use crate::error::Result;
-use crate::geometry::Geometry;
-use crate::session::{FrameUse, Session};
+use crate::reconstruction::{nertca_reconstruction, on_reconstruction};
+use crate::status::{Outcome, nertca_status};
+use crate::types::{nertca_correction, nertca_geometry, read, write};
+use nertca_vk::calibrate::choose::Correction;
+use nertca_vk::error::Result;
+use nertca_vk::geometry::Geometry;
+use nertca_vk::session::{FrameUse, Session};
 
 /// The stated geometry of the frame is used.
 pub const NERTCA_CORRECTION_STATED: u32 = 0;

@@ -1,9 +1,9 @@
 //! Training: in the calling thread, or in the background.
 
-use crate::capi::reconstruction::{nertca_reconstruction, on_reconstruction};
-use crate::capi::status::{Failure, nertca_status};
-use crate::capi::types::{NERTCA_STATE_RUNNING, nertca_progress, nertca_progress_callback};
-use crate::session::Progress;
+use crate::reconstruction::{nertca_reconstruction, on_reconstruction};
+use crate::status::{Failure, nertca_status};
+use crate::types::{NERTCA_STATE_RUNNING, nertca_progress, nertca_progress_callback};
+use nertca_vk::session::Progress;
 use std::ffi::c_void;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -74,7 +74,7 @@ pub unsafe extern "C" fn nertca_reconstruction_train(
             unsafe { done.write_unaligned(trained) };
         }
         if cancelled || reconstruction.session.is_closed() {
-            Err(crate::error::Error::Interrupted.into())
+            Err(nertca_vk::error::Error::Interrupted.into())
         } else {
             Ok(())
         }

@@ -1,23 +1,23 @@
 //! Output: views, volumes, scores, and buffers shared with other APIs.
 
-use crate::capi::boundary::call;
-use crate::capi::context::{Claim, Context, nertca_context, on_context};
-use crate::capi::handles::{self, Kind};
-use crate::capi::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
-use crate::capi::shared_memory;
-use crate::capi::status::{Failure, NERTCA_ERROR_NOT_READY, NERTCA_OK, Outcome, nertca_status};
-use crate::capi::types::{
+use crate::boundary::call;
+use crate::context::{Claim, Context, nertca_context, on_context};
+use crate::handles::{self, Kind};
+use crate::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
+use crate::shared_memory;
+use crate::status::{Failure, NERTCA_ERROR_NOT_READY, NERTCA_OK, Outcome, nertca_status};
+use crate::types::{
     NERTCA_COMPONENT_DYNAMIC, NERTCA_COMPONENT_STATIC, NERTCA_COMPONENT_TOTAL, NERTCA_PIXELS_F32, NERTCA_PIXELS_U8,
     NERTCA_PROJECTION_DRR, NERTCA_PROJECTION_MIP, NERTCA_QUALITY_EXACT, NERTCA_QUALITY_LIVE, nertca_drawn, nertca_grid,
     nertca_image, nertca_view, pixel_bytes, read, sides, stride, write,
 };
-use crate::geometry::{MM_PER_UNIT, ViewRays};
-use crate::gpu::buffer::Buffer;
-use crate::model::component::Component;
-use crate::render::grid::PatientGrid;
-use crate::render::quantity::{Projection, Quantity};
-use crate::session::Drawn;
 use glam::DVec3;
+use nertca_vk::geometry::{MM_PER_UNIT, ViewRays};
+use nertca_vk::gpu::buffer::Buffer;
+use nertca_vk::model::component::Component;
+use nertca_vk::render::grid::PatientGrid;
+use nertca_vk::render::quantity::{Projection, Quantity};
+use nertca_vk::session::Drawn;
 use std::sync::Arc;
 
 /// A buffer in device memory that other APIs and processes can import.

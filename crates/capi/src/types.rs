@@ -1,9 +1,9 @@
 //! Structs of the ABI. Each begins with its size, so that later versions can add fields at its end.
 
-use crate::capi::status::{Failure, Outcome};
-use crate::geometry::{CArm, Geometry, Matrix};
-use crate::scan::dataset::{Intensity, Split};
-use crate::session::{FrameTime, NewFrame, State};
+use crate::status::{Failure, Outcome};
+use nertca_vk::geometry::{CArm, Geometry, Matrix};
+use nertca_vk::scan::dataset::{Intensity, Split};
+use nertca_vk::session::{FrameTime, NewFrame, State};
 use std::ffi::{c_char, c_void};
 
 /// Unsigned 8-bit pixels.
@@ -610,7 +610,7 @@ impl nertca_geometry {
 }
 
 /// Largest side of an image.
-const MAX_SIDE: u32 = crate::formats::image_limits::MAX_SIDE as u32;
+const MAX_SIDE: u32 = nertca_vk::formats::image_limits::MAX_SIDE as u32;
 
 /// Checks width and height of an image.
 pub(super) fn sides(width: u32, height: u32) -> Outcome<(usize, usize)> {

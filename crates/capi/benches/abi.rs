@@ -2,10 +2,6 @@
 //! given as argument: `cargo bench --bench abi -- DATASET [ITERATIONS] [REPEATS]`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "a measurement")]
 
-use nertca_vk::capi::context::*;
-use nertca_vk::capi::reconstruction::*;
-use nertca_vk::capi::training::*;
-use nertca_vk::capi::types::*;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::geometry::{Geometry, MM_PER_UNIT};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
@@ -13,6 +9,10 @@ use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::plan::Plan;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_abi::context::*;
+use nertca_vk_abi::reconstruction::*;
+use nertca_vk_abi::training::*;
+use nertca_vk_abi::types::*;
 use std::ffi::CString;
 use std::ptr::{null, null_mut};
 use std::time::Instant;

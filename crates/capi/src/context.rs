@@ -1,16 +1,16 @@
 //! Contexts: a device, a log, limits.
 
-use crate::capi::boundary::call;
-use crate::capi::handles::{self, Kind};
-use crate::capi::log;
-use crate::capi::options::{Options, text};
-use crate::capi::status::{Failure, NERTCA_ERROR_BUSY, Outcome, copy_text, nertca_status};
-use crate::capi::types::{nertca_log, nertca_vulkan, read};
-use crate::gpu::device::{Adoption, DeviceOptions, Gpu, QueueLock, list_devices};
-use crate::gpu::pipeline::KeptPipelines;
-use crate::kernels::cache::save_pipeline_cache;
-use crate::kernels::tuning::{Layers, Tuning};
+use crate::boundary::call;
+use crate::handles::{self, Kind};
+use crate::log;
+use crate::options::{Options, text};
+use crate::status::{Failure, NERTCA_ERROR_BUSY, Outcome, copy_text, nertca_status};
+use crate::types::{nertca_log, nertca_vulkan, read};
 use ash::vk::{self, Handle};
+use nertca_vk::gpu::device::{Adoption, DeviceOptions, Gpu, QueueLock, list_devices};
+use nertca_vk::gpu::pipeline::KeptPipelines;
+use nertca_vk::kernels::cache::save_pipeline_cache;
+use nertca_vk::kernels::tuning::{Layers, Tuning};
 use std::ffi::{c_char, c_void};
 use std::num::NonZeroU64;
 use std::sync::Arc;
@@ -45,7 +45,7 @@ impl Kind for Context {
 
 impl Context {
     pub fn device(&self) -> Outcome<&Gpu> {
-        let none = || crate::error::Error::NoDevice("the context was created without a device".into());
+        let none = || nertca_vk::error::Error::NoDevice("the context was created without a device".into());
         Ok(self.gpu.as_ref().ok_or_else(none)?)
     }
 }

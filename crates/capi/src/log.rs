@@ -1,7 +1,7 @@
 //! Sends the engine's log messages to the caller's log callback; nothing is printed.
 
-use crate::capi::status::{Failure, Outcome};
-use crate::capi::types::nertca_log;
+use crate::status::{Failure, Outcome};
+use crate::types::nertca_log;
 use std::ffi::{CString, c_char, c_void};
 use std::fmt::Write as _;
 use tracing::field::{Field, Visit};
@@ -59,7 +59,7 @@ impl Visit for Text {
 }
 
 impl Subscriber for Callback {
-    /// Never gives a final answer, because other contexts have logs of their own; see [`crate::capi::callsites`].
+    /// Never gives a final answer, because other contexts have logs of their own; see [`crate::callsites`].
     fn register_callsite(&self, _: &'static Metadata<'static>) -> Interest {
         Interest::sometimes()
     }

@@ -2,7 +2,7 @@
 //! another type or is arbitrary can therefore be recognised without touching memory. The table is the only process-wide
 //! state of the ABI's objects.
 
-use crate::capi::status::{Failure, NERTCA_ERROR_FORKED, NERTCA_ERROR_HANDLE, Outcome};
+use crate::status::{Failure, NERTCA_ERROR_FORKED, NERTCA_ERROR_HANDLE, Outcome};
 use std::any::Any;
 use std::cell::RefCell;
 use std::sync::{Arc, PoisonError, RwLock};

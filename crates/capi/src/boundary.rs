@@ -1,8 +1,8 @@
 //! The boundary around every call: it catches all panics, and keeps the texts of failures.
 
-use crate::capi::status::{Failure, NERTCA_ERROR_INTERNAL, NERTCA_OK, Outcome, copy_text, nertca_status};
-use crate::capi::{callsites, handles};
-use crate::session::TRAINING_THREAD;
+use crate::status::{Failure, NERTCA_ERROR_INTERNAL, NERTCA_OK, Outcome, copy_text, nertca_status};
+use crate::{callsites, handles};
+use nertca_vk::session::TRAINING_THREAD;
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
 use std::ffi::{c_char, c_void};

@@ -1,10 +1,10 @@
 //! Vessels as trees of centrelines with radii.
 
-use crate::capi::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
-use crate::capi::status::{Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_NOT_READY, Outcome, nertca_status};
-use crate::capi::types::{nertca_lesion, nertca_tree, read, write};
-use crate::trees::lesions::{Lesion, lesions};
-use crate::trees::tree::{BeatTree, Branch, RadiiFrom};
+use crate::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
+use crate::status::{Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_NOT_READY, Outcome, nertca_status};
+use crate::types::{nertca_lesion, nertca_tree, read, write};
+use nertca_vk::trees::lesions::{Lesion, lesions};
+use nertca_vk::trees::tree::{BeatTree, Branch, RadiiFrom};
 use std::sync::PoisonError;
 
 /// Finds the vessels at all phases as trees of centrelines with radii. If all arrays of `tree` are null, the call searches and
@@ -219,8 +219,8 @@ impl FlatTree {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trees::tree::PhaseTree;
     use glam::DVec3;
+    use nertca_vk::trees::tree::PhaseTree;
 
     #[test]
     fn branches_of_all_phases_follow_each_other_with_their_gaps() {

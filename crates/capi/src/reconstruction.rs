@@ -1,25 +1,25 @@
 //! Reconstructions: adding frames, saving and loading checkpoints.
 
-use crate::capi::boundary::call;
-use crate::capi::context::{Claim, Context, nertca_context, on_context};
-use crate::capi::handles::{self, Kind};
-use crate::capi::options::{Options, text};
-use crate::capi::status::{
+use crate::boundary::call;
+use crate::context::{Claim, Context, nertca_context, on_context};
+use crate::handles::{self, Kind};
+use crate::options::{Options, text};
+use crate::status::{
     Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_BUSY, NERTCA_ERROR_NOT_READY, NERTCA_OK, Outcome, copy_text,
     nertca_status,
 };
-use crate::capi::types::{
+use crate::types::{
     NERTCA_USE_NO_PHASE, NERTCA_USE_ONE_PHASE, NERTCA_USE_TRAINING, NERTCA_USE_VALIDATION, nertca_frame,
     nertca_frame_status, nertca_progress, read, state_code, write,
 };
-use crate::checkpoint::Checkpoint;
-use crate::choice::Choice;
-use crate::config::{Config, Preset};
-use crate::scan::at_rest;
-use crate::scan::gating::RPeaks;
-use crate::scan::prior::{MAX_PRIOR_POINTS, VesselPrior};
-use crate::session::{FrameUse, Progress, Session, SessionOptions};
-use crate::trees::tree::BeatTree;
+use nertca_vk::checkpoint::Checkpoint;
+use nertca_vk::choice::Choice;
+use nertca_vk::config::{Config, Preset};
+use nertca_vk::scan::at_rest;
+use nertca_vk::scan::gating::RPeaks;
+use nertca_vk::scan::prior::{MAX_PRIOR_POINTS, VesselPrior};
+use nertca_vk::session::{FrameUse, Progress, Session, SessionOptions};
+use nertca_vk::trees::tree::BeatTree;
 use std::ffi::{c_char, c_void};
 use std::path::Path;
 use std::sync::{Arc, Mutex};

@@ -1,15 +1,15 @@
 //! Memory that other processes and APIs import through file descriptors. Only Unix has it; other systems return an
 //! error.
 
-use crate::error::Result;
-use crate::gpu::buffer::Buffer;
-use crate::gpu::device::Gpu;
+use nertca_vk::error::Result;
+use nertca_vk::gpu::buffer::Buffer;
+use nertca_vk::gpu::device::Gpu;
 
 #[cfg(unix)]
 mod system {
     use super::{Buffer, Gpu, Result};
-    use crate::error::Error;
-    use crate::gpu::buffer::ExportedMemory;
+    use nertca_vk::error::Error;
+    use nertca_vk::gpu::buffer::ExportedMemory;
     use std::os::fd::{AsFd, IntoRawFd};
 
     /// Memory of a buffer, for import by others.
@@ -37,7 +37,7 @@ mod system {
 #[cfg(not(unix))]
 mod system {
     use super::{Buffer, Gpu, Result};
-    use crate::error::Error;
+    use nertca_vk::error::Error;
 
     /// This type has no values: such memory does not exist here.
     pub enum Memory {}

@@ -1,13 +1,13 @@
 //! True vessels given by the caller, and scores.
 
-use crate::capi::output::grid_of;
-use crate::capi::reconstruction::{nertca_reconstruction, on_reconstruction};
-use crate::capi::status::{Failure, Outcome, nertca_status};
-use crate::capi::types::{nertca_grid, nertca_scores, nertca_tree, read, write};
-use crate::score::eval::Evaluation;
-use crate::score::trees::TrueLine;
-use crate::score::volume::TrueVessels;
+use crate::output::grid_of;
+use crate::reconstruction::{nertca_reconstruction, on_reconstruction};
+use crate::status::{Failure, Outcome, nertca_status};
+use crate::types::{nertca_grid, nertca_scores, nertca_tree, read, write};
 use glam::DVec3;
+use nertca_vk::score::eval::Evaluation;
+use nertca_vk::score::trees::TrueLine;
+use nertca_vk::score::volume::TrueVessels;
 use std::collections::BTreeMap;
 
 /// Maximum number of points and of branches of a true tree.

@@ -1,9 +1,9 @@
 //! Semaphores by which other APIs and devices wait for what was drawn into a shared buffer.
 
-use crate::capi::boundary::call;
-use crate::capi::context::{Claim, Context, nertca_context, on_context};
-use crate::capi::handles::{self, Kind};
-use crate::capi::status::{Failure, NERTCA_ERROR_BUSY, NERTCA_OK, nertca_status};
+use crate::boundary::call;
+use crate::context::{Claim, Context, nertca_context, on_context};
+use crate::handles::{self, Kind};
+use crate::status::{Failure, NERTCA_ERROR_BUSY, NERTCA_OK, nertca_status};
 use std::sync::Arc;
 
 /// A semaphore of the device that other APIs and processes can import.
@@ -13,9 +13,9 @@ pub struct nertca_semaphore {
 
 #[cfg(unix)]
 mod system {
-    use crate::error::{Error, Result};
-    use crate::gpu::device::Gpu;
-    use crate::gpu::semaphore::ExportedSemaphore;
+    use nertca_vk::error::{Error, Result};
+    use nertca_vk::gpu::device::Gpu;
+    use nertca_vk::gpu::semaphore::ExportedSemaphore;
     use std::os::fd::IntoRawFd;
 
     /// Semaphore that others import by descriptors.
@@ -40,8 +40,8 @@ mod system {
 
 #[cfg(not(unix))]
 mod system {
-    use crate::error::{Error, Result};
-    use crate::gpu::device::Gpu;
+    use nertca_vk::error::{Error, Result};
+    use nertca_vk::gpu::device::Gpu;
 
     /// This type has no values: such semaphores do not exist here.
     pub enum Semaphore {}
