@@ -80,9 +80,6 @@
 //! superior).
 
 pub mod choice;
-pub mod error;
-pub mod fingerprint;
-pub(crate) mod linear;
 pub mod random;
 pub mod tensors;
 
@@ -93,7 +90,10 @@ pub use nertca_vk_gpu as gpu;
 pub use nertca_vk_formats as formats;
 pub use nertca_vk_formats::{files, raster};
 
-pub mod geometry;
+/// Angiograms, and what is known of them without a device: a crate of its own.
+pub use nertca_vk_angiograms::{calibrate, check, error, evidence, fingerprint, geometry, linear, scan};
+
+pub mod config;
 
 /// The compute stages.
 pub mod kernels {
@@ -105,66 +105,6 @@ pub mod kernels {
     pub mod stages;
     pub mod tuning;
 }
-
-/// Angiograms with their geometry and phase.
-pub mod scan {
-    pub mod at_rest;
-    mod builder;
-    pub mod canvas;
-    pub mod dataset;
-    pub(crate) mod frame_checks;
-    pub mod gating;
-    pub(crate) mod hidden;
-    pub mod nerfca;
-    pub mod pixels;
-    pub mod prior;
-    mod reading;
-    pub mod references;
-    pub mod rtk;
-    pub(crate) mod same_view;
-    pub mod truth;
-    pub mod writer;
-}
-
-/// Import of clinical runs into a dataset.
-#[cfg(feature = "dicom")]
-pub mod import {
-    pub mod angiograms;
-    mod beats;
-    mod codecs;
-    pub mod dicom;
-    pub mod ecg;
-    mod elements;
-    mod enhanced;
-    pub mod folder;
-    mod frames;
-    pub mod image_beat;
-    pub mod intake;
-    pub mod pictures;
-    mod reader;
-    mod sources;
-    mod stands;
-    pub mod stated;
-    mod timing;
-    mod traces;
-    pub mod views_file;
-}
-
-/// Evidence of each single view: its static background, its noise, and where vessels may be.
-pub mod evidence {
-    pub mod background;
-    pub mod drift;
-    mod filters;
-    mod interiors;
-    pub mod noise;
-    pub mod ratios;
-    pub mod series;
-}
-
-pub mod calibrate;
-pub mod check;
-
-pub mod config;
 
 /// Gaussians, which several methods share: as data, in checkpoints, and on the device, where views see them.
 pub mod gaussians {

@@ -26,6 +26,7 @@ use crate::kernels::stages;
 use crate::kernels::tuning::{Layers, MatrixTuning, Tuning};
 use crate::methods;
 use crate::scan::dataset::Dataset;
+use crate::scan::small::{small_dataset, uneven_dataset};
 use compare::{Findings, Row};
 use serde::Serialize;
 use std::time::Instant;
@@ -152,7 +153,7 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<TestPart<'a>> {
 /// # Errors
 /// [`Error::DeviceLost`], after which nothing can be compared; other errors are part of the report.
 pub fn run(gpu: &Gpu, progress: &mut dyn FnMut(Progress<'_>)) -> Result<Report> {
-    let (even, dataset) = (problems::small_dataset(13, 11, 3)?, problems::uneven_dataset(13, 11)?);
+    let (even, dataset) = (small_dataset(13, 11, 3)?, uneven_dataset(13, 11)?);
     let chosen = Tuning::for_device(gpu.info());
     let on = |layers| chosen.clone().with_layers(layers, String::new());
     let (f32_layers, matrices) = (on(Layers::F32), on(Layers::Matrices));

@@ -57,7 +57,7 @@ pub(super) fn thinned(dataset: &Dataset, step: usize) -> Dataset {
 mod tests {
     use super::*;
     use crate::config::Preset;
-    use crate::selftest::problems::uneven_dataset;
+    use crate::scan::small::uneven_dataset;
 
     #[test]
     fn only_thin_batches_of_unconfined_networks_validate_fewer_pixels() {

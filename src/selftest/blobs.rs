@@ -16,8 +16,9 @@ use crate::render::grid::Grid;
 use crate::render::quantity::{Projection, Quantity};
 use crate::render::renderer::Renderer;
 use crate::scan::dataset::Dataset;
+use crate::scan::small::small_dataset;
 use crate::selftest::compare::{Findings, Tolerance};
-use crate::selftest::problems::{drawn_fields, random_gaussians, small_dataset};
+use crate::selftest::problems::{drawn_fields, random_gaussians};
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 

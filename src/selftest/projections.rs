@@ -7,8 +7,8 @@ use crate::gpu::device::Gpu;
 use crate::kernels::push::{self, PushConstants};
 use crate::phantom::projector::Projector;
 use crate::reference::projector::project_pixel;
+use crate::scan::small;
 use crate::selftest::compare::{Findings, Tolerance};
-use crate::selftest::problems;
 use glam::{DAffine3, DMat3, DVec3};
 
 const PROJECT: &[&str] = &[push::Project::SHADER];
@@ -66,5 +66,5 @@ fn rays((primary_deg, secondary_deg): (f64, f64)) -> Result<ViewRays> {
         offset_mm: [3.0, 0.0],
         table_mm: [0.0; 3],
     };
-    problems::rays(&Geometry::CArm(arm), SIZE[0], SIZE[1])
+    small::rays(&Geometry::CArm(arm), SIZE[0], SIZE[1])
 }

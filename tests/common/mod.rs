@@ -18,6 +18,7 @@ use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::phantom::views::ViewAngles;
 use nertca_vk::random::{STREAM_PHOTON, normal};
 use nertca_vk::scan::dataset::{Dataset, Layout, Split};
+use nertca_vk::scan::small;
 pub use nertca_vk::selftest::compare::relative_error;
 use nertca_vk::selftest::compare::{Findings, Row};
 use nertca_vk::selftest::problems;
@@ -54,12 +55,12 @@ pub fn expect_silence(gpu: Gpu) {
 
 /// A smooth blob that moves over three phases in front of a static gradient, in three views.
 pub fn small_dataset(width: usize, height: usize) -> Dataset {
-    problems::small_dataset(width, height, 3).unwrap()
+    small::small_dataset(width, height, 3).unwrap()
 }
 
 /// A dataset like [`small_dataset`], with some images taken between two phases.
 pub fn uneven_dataset(width: usize, height: usize) -> Dataset {
-    problems::uneven_dataset(width, height).unwrap()
+    small::uneven_dataset(width, height).unwrap()
 }
 
 /// A configuration small enough for f64 twins, on top of a preset.

@@ -35,16 +35,13 @@ pub const PARSERS: &[Parser] = &[
     Parser { name: "npy", file: "v.npy", seeds: npy_volumes, parse: reads_volume },
     Parser { name: "npy_image", file: "i.npy", seeds: npy_images, parse: reads_image },
     Parser { name: "png", file: "i.png", seeds: png_images, parse: reads_image },
-    #[cfg(feature = "dicom")]
     Parser { name: "jpeg", file: "f.jpg", seeds: || vec![crate::dicom::baseline()], parse: reads_frames },
-    #[cfg(feature = "dicom")]
     Parser { name: "tiff", file: "f.tif", seeds: tiff_frames, parse: reads_frames },
-    #[cfg(feature = "dicom")]
     Parser {
         name: "views_file",
         file: "views.toml",
         seeds: || vec![VIEWS.as_bytes().to_vec()],
-        parse: |p| nertca_vk::import::views_file::read(p).is_ok(),
+        parse: |p| nertca_vk_import::views_file::read(p).is_ok(),
     },
     Parser {
         name: "rtk",
@@ -68,12 +65,11 @@ pub const PARSERS: &[Parser] = &[
         parse: |p| opens(&FRAMES, p),
     },
     Parser { name: "checkpoint", file: "c.safetensors", seeds: checkpoints, parse: |p| Checkpoint::read(p).is_ok() },
-    #[cfg(feature = "dicom")]
     Parser {
         name: "dicom",
         file: "a.dcm",
         seeds: angiograms,
-        parse: |p| nertca_vk::import::dicom::Run::read(p, None).is_ok(),
+        parse: |p| nertca_vk_import::dicom::Run::read(p, None).is_ok(),
     },
 ];
 
@@ -151,13 +147,11 @@ fn png_images() -> Vec<Vec<u8>> {
     vec![png::grey8(10, 6, &codes8).unwrap(), written("i.png", |p| png::write_grey16(p, 10, 6, codes16).unwrap())]
 }
 
-#[cfg(feature = "dicom")]
 fn reads_frames(path: &Path) -> bool {
     nertca_vk::formats::frames::read(path).is_ok()
 }
 
 /// A file of two pages of 2 x 2 pixels: a header, their values, and a directory for each page.
-#[cfg(feature = "dicom")]
 fn tiff_frames() -> Vec<Vec<u8>> {
     const PIXELS_AT: [u32; 2] = [8, 12];
     // Width, height, bits, no compression, white is the largest value, place of the values, rows, bytes.
@@ -179,7 +173,6 @@ fn tiff_frames() -> Vec<Vec<u8>> {
     vec![file]
 }
 
-#[cfg(feature = "dicom")]
 const VIEWS: &str = "still = false\n[all]\nsid_mm = 1050\nsod_mm = 750\npixel_mm = 0.3\nfps = 15\n[[view]]\npath = \"lao\"\n\
     angles_deg = [-30, 20]\nheart_rate_per_min = 72\n[[view]]\npath = \"rao\"\nangles_deg = [40.5, -1e1]\nsid_mm = 1100\n\
     offset_mm = [3, -1]\nr_peaks_s = [0.05, 0.88, 1.71]\n";
@@ -253,7 +246,6 @@ fn checkpoints() -> Vec<Vec<u8>> {
     vec![Trainer::new(&gpu, plan, &data, common::tuning(&gpu)).unwrap().checkpoint().unwrap().to_bytes().unwrap()]
 }
 
-#[cfg(feature = "dicom")]
 fn angiograms() -> Vec<Vec<u8>> {
     let directory = scratch();
     let plain = written("a.dcm", |p| crate::dicom::angiogram(p, |_| ()));

@@ -21,6 +21,7 @@ use nertca_vk::methods::dynamic_gaussians::selftest as deformable;
 use nertca_vk::methods::sax_nerf::selftest as sax;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
+use nertca_vk::scan::small;
 use nertca_vk::selftest::{drawing, gaussians, problems, repeats};
 use nertca_vk::train::trainer::Trainer;
 
@@ -111,7 +112,7 @@ fn images_larger_than_a_buffer_are_fitted_alike() {
 fn rays_of_images_larger_than_a_buffer_are_drawn_alike() {
     const STEPS: u32 = 8;
     // Seventeen images: a buffer holds all but one.
-    let dataset = problems::small_dataset(SIDE, SIDE, 6).unwrap();
+    let dataset = small::small_dataset(SIDE, SIDE, 6).unwrap();
     assert!(dataset.training().len() > 16, "{} images", dataset.training().len());
     let config = small_config("fast-mlp", &["occupancy.enabled=false"]);
     let trained = |gpu: &Gpu| {

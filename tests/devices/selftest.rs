@@ -18,9 +18,10 @@ use nertca_vk::methods::sax_nerf::selftest as sax;
 use nertca_vk::methods::x_gaussian::selftest as x_gaussian;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
+use nertca_vk::scan::small;
 use nertca_vk::selftest::compare::Findings;
 use nertca_vk::selftest::iteration::F32_CASES;
-use nertca_vk::selftest::{blobs, gaussians, iteration, networks, problems};
+use nertca_vk::selftest::{blobs, gaussians, iteration, networks};
 use nertca_vk::train::trainer::Trainer;
 use std::collections::BTreeSet;
 
@@ -138,7 +139,7 @@ fn the_inventory_is_what_a_run_builds() {
         let inventory = inventory::compile(&listed, &config, 3, &tuning(&listed)).unwrap();
         let names: BTreeSet<String> = inventory.iter().map(Compiled::name).collect();
         let used = open();
-        let dataset = problems::small_dataset(size, size, 5).unwrap();
+        let dataset = small::small_dataset(size, size, 5).unwrap();
         let config = Config { train: Train { chunk_samples: 1 << 14, ..config.train.clone() }, ..config };
         let mut trainer = Trainer::new(&used, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&used)).unwrap();
         while trainer.step() < config.gaussian_iterations() {

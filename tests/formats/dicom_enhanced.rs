@@ -1,8 +1,8 @@
 //! Enhanced XA objects, whose geometry, times, shutters and heart beat stand in functional groups.
 
 use crate::pydicom::Files;
-use nertca_vk::import::dicom::Relationship;
 use nertca_vk::scan::gating::BeatScaling;
+use nertca_vk_import::dicom::Relationship;
 
 /// Writes an Enhanced XA object: what differs between frames stands in their own groups, everything else in the shared one.
 const OBJECT: &str = "

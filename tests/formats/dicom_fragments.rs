@@ -2,7 +2,7 @@
 
 use crate::dicom::compressed_run;
 use crate::pydicom::Files;
-use nertca_vk::import::dicom::Run;
+use nertca_vk_import::dicom::Run;
 
 /// Names for the scripts: `lossless` and `baseline` have the JPEG images of all frames, `SYNTAX` their transfer syntaxes.
 const JPEG: &str = "

@@ -5,8 +5,8 @@ use dicom_core::value::DataSetSequence;
 use dicom_core::{DataElement, PrimitiveValue, Tag, VR};
 use dicom_dictionary_std::tags;
 use dicom_object::InMemDicomObject;
-use nertca_vk::import::dicom::Run;
 use nertca_vk::scan::gating::{BeatScaling, RPeaks};
+use nertca_vk_import::dicom::Run;
 
 fn read(change: impl Fn(&mut InMemDicomObject)) -> nertca_vk::error::Result<Run> {
     let directory = tempfile::tempdir().unwrap();

@@ -4,7 +4,7 @@ use crate::dicom;
 use crate::pydicom::Files;
 use dicom_core::{DataElement, PrimitiveValue, VR};
 use dicom_dictionary_std::tags;
-use nertca_vk::import::dicom::Run;
+use nertca_vk_import::dicom::Run;
 
 #[test]
 fn elements_of_unknown_type_hold_implicit_types() {

@@ -4,9 +4,9 @@
 use crate::shared::shared;
 use glam::DVec3;
 use nertca_vk::geometry::{CArm, Geometry, ViewRays, world_from_lps_mm};
-use nertca_vk::import::image_beat::beat;
 use nertca_vk::random::{STREAM_PHOTON, normal};
 use nertca_vk::raster::Image;
+use nertca_vk_import::image_beat::beat;
 use serde::Deserialize;
 
 const SIZE: usize = 96;

@@ -3,10 +3,10 @@
 use crate::dicom;
 use dicom_core::{DataElement, PrimitiveValue, VR};
 use dicom_dictionary_std::tags;
-use nertca_vk::import::angiograms::{Gating, ImportOptions};
-use nertca_vk::import::intake::import_dicom;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::scan::gating::BeatScaling;
+use nertca_vk_import::angiograms::{Gating, ImportOptions};
+use nertca_vk_import::intake::import_dicom;
 use std::ops::RangeInclusive;
 use std::path::Path;
 

@@ -14,23 +14,15 @@ mod root;
 #[path = "../common/shared.rs"]
 mod shared;
 
-#[cfg(feature = "dicom")]
 mod dicom_enhanced;
-#[cfg(feature = "dicom")]
 mod dicom_fragments;
-#[cfg(feature = "dicom")]
 mod dicom_runs;
-#[cfg(feature = "dicom")]
 mod dicom_structure;
-#[cfg(feature = "dicom")]
 mod image_beat;
-#[cfg(feature = "dicom")]
 mod import_frames;
 mod malformed;
-#[cfg(feature = "dicom")]
 mod modality_luts;
 mod nerfca;
-#[cfg(feature = "dicom")]
 mod pydicom;
 mod real_data;
 mod rtk;

@@ -3,7 +3,7 @@
 //! a failure names its seed, and `NERTCA_MALFORMED_SEED` repeats it.
 
 use crate::parsers::{MAX_ALLOCATION_BYTES, PARSERS, Parser, scratch};
-use nertca_vk::import::ecg;
+use nertca_vk_import::ecg;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -253,7 +253,7 @@ write('unknown', before_pixels(element(0x21, 0x1010, b'UN', item(implicit(0x21, 
     );
     let seeds: Vec<Vec<u8>> = files.names().iter().map(|name| std::fs::read(files.path(name)).unwrap()).collect();
     assert_eq!(seeds.len(), 5);
-    feed_files("dicom, compressed", "c.dcm", &seeds, |p| nertca_vk::import::dicom::Run::read(p, None).is_ok());
+    feed_files("dicom, compressed", "c.dcm", &seeds, |p| nertca_vk_import::dicom::Run::read(p, None).is_ok());
 }
 
 #[test]

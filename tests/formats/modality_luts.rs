@@ -6,11 +6,11 @@ use dicom_core::value::DataSetSequence;
 use dicom_core::{DataElement, PrimitiveValue, VR};
 use dicom_dictionary_std::tags;
 use dicom_object::InMemDicomObject;
-use nertca_vk::import::angiograms::{Gating, ImportOptions};
-use nertca_vk::import::dicom::Run;
-use nertca_vk::import::intake::import_dicom;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::scan::gating::BeatScaling;
+use nertca_vk_import::angiograms::{Gating, ImportOptions};
+use nertca_vk_import::dicom::Run;
+use nertca_vk_import::intake::import_dicom;
 use std::path::Path;
 
 const FRAMES: usize = 6;

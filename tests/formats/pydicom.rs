@@ -3,7 +3,7 @@
 use crate::dicom;
 use crate::python::python;
 use dicom_object::InMemDicomObject;
-use nertca_vk::import::dicom::Run;
+use nertca_vk_import::dicom::Run;
 use std::path::{Path, PathBuf};
 
 /// Names for the scripts: `base` is a run of six frames of 64 x 64 pixels, of 8 bits, with explicit types.

@@ -4,8 +4,6 @@
 use crate::shared::shared;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
-use nertca_vk::import::angiograms::{Gating, ImportOptions};
-use nertca_vk::import::intake::import_dicom;
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
@@ -13,6 +11,8 @@ use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::scan::gating::BeatScaling;
 use nertca_vk::train::trainer::Trainer;
 use nertca_vk::vessels::threshold::vessel_threshold;
+use nertca_vk_import::angiograms::{Gating, ImportOptions};
+use nertca_vk_import::intake::import_dicom;
 use std::path::PathBuf;
 
 fn runs() -> Option<Vec<PathBuf>> {

@@ -6,10 +6,10 @@ use clap::{ArgAction, Args};
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
-use nertca_vk::import::angiograms::{Gating, ImportOptions};
-use nertca_vk::import::intake::StatedRun;
-use nertca_vk::import::stated::StatedGeometry;
 use nertca_vk::scan::gating::{BeatScaling, RPeaks};
+use nertca_vk_import::angiograms::{Gating, ImportOptions};
+use nertca_vk_import::intake::StatedRun;
+use nertca_vk_import::stated::StatedGeometry;
 use std::path::{Path, PathBuf};
 
 /// Largest accepted size of a list of times or phases, bytes.

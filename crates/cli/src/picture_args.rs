@@ -6,11 +6,11 @@ use super::synthetic_args::{AngleList, pitch, view_angles};
 use clap::{Args, ValueEnum};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::geometry::CArm;
-use nertca_vk::import::angiograms::{Gating, ImportOptions};
-use nertca_vk::import::dicom::Relationship;
-use nertca_vk::import::intake::import_pictures;
-use nertca_vk::import::pictures::{PictureView, PixelMeaning};
-use nertca_vk::import::views_file::{self, ViewsFile};
+use nertca_vk_import::angiograms::{Gating, ImportOptions};
+use nertca_vk_import::dicom::Relationship;
+use nertca_vk_import::intake::import_pictures;
+use nertca_vk_import::pictures::{PictureView, PixelMeaning};
+use nertca_vk_import::views_file::{self, ViewsFile};
 use std::path::{Path, PathBuf};
 
 /// Arguments of `import pictures`.

@@ -53,7 +53,7 @@ mod tests {
     use super::*;
     use crate::config::{Config, Preset};
     use crate::fields::motion::analyse;
-    use crate::selftest::problems::small_dataset;
+    use crate::scan::small::small_dataset;
 
     #[test]
     fn changes_are_those_of_the_transmission_from_0_to_1_in_each_view() {

@@ -17,9 +17,9 @@ use crate::plan::Plan;
 use crate::random::{STREAM_JITTER, normal};
 use crate::reference::gaussians::{N_PARAMS, Params};
 use crate::reference::ssim;
+use crate::scan::small::small_dataset;
 use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::{TENSORS, f32s, numbers, of_rows};
-use crate::selftest::problems::small_dataset;
 use glam::DVec3;
 
 const PROJECT: &[&str] = &[push::R2Project::SHADER];

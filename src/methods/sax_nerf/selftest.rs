@@ -19,8 +19,8 @@ use crate::methods::sax_nerf::twin::{self as reference, Lineformer};
 use crate::model::field::{FieldDrawing, Row};
 use crate::plan::Plan;
 use crate::random::{STREAM_JITTER, normal};
+use crate::scan::small::small_dataset;
 use crate::selftest::compare::{Findings, Tolerance, told};
-use crate::selftest::problems::small_dataset;
 
 const BATCH: &[&str] = &[push::SaxBatch::SHADER];
 const POINTS: &[&str] = &[push::SaxPoints::SHADER];

@@ -16,9 +16,9 @@ use crate::methods::x_gaussian::twin::{self as reference, Blot, N_PARAMS, Params
 use crate::plan::Plan;
 use crate::random::{STREAM_JITTER, normal};
 use crate::reference::ssim::picture_loss;
+use crate::scan::small::small_dataset;
 use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::f32s;
-use crate::selftest::problems::small_dataset;
 use glam::DVec2;
 use std::ops::Range;
 

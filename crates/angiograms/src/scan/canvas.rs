@@ -35,7 +35,7 @@ pub fn continued(image: Image, [width, height]: [usize; 2]) -> Image {
 
 /// Extends frames from the sizes of their views to a canvas that holds all of them. Returns the canvas (columns, rows), or none
 /// without frames.
-pub(crate) fn onto_canvas(views: &[View], frames: &mut [Frame]) -> Result<Option<[usize; 2]>, Complaint> {
+pub fn onto_canvas(views: &[View], frames: &mut [Frame]) -> Result<Option<[usize; 2]>, Complaint> {
     let sizes = || frames.iter().map(|frame| views[frame.view].size);
     let Some(canvas) = sizes().reduce(|a, b| [a[0].max(b[0]), a[1].max(b[1])]) else { return Ok(None) };
     if sizes().all(|size| size == canvas) {

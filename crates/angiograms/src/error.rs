@@ -1,16 +1,17 @@
-//! The error type of the crate, with one variant per case that a caller can handle.
+//! The error type that all crates of the project share, with one variant per case that a caller can handle.
 
 use nertca_vk_formats as formats;
+#[cfg(feature = "gpu")]
 use nertca_vk_gpu as gpu;
 use std::path::{Path, PathBuf};
 
-/// Result of every fallible function of this crate.
+/// Result of every fallible function.
 pub type Result<T> = std::result::Result<T, Error>;
 
 /// Settings that reduce the memory of most runs; see [`Error::OutOfMemory`].
 pub const SMALLER_BATCHES: &str = "a lower train.chunk_samples or train.rays";
 
-/// Error of this crate: its cause, its place, and advice where there is any.
+/// Error of the project: its cause, its place, and advice where there is any.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -58,6 +59,7 @@ pub enum Error {
     #[error("no usable Vulkan device: {0}")]
     NoDevice(String),
     /// A Vulkan call failed.
+    #[cfg(feature = "gpu")]
     #[error("Vulkan: {call} failed for {object}: {code}")]
     Vulkan {
         /// Name of the Vulkan entry point.
@@ -155,6 +157,7 @@ impl From<formats::error::Error> for Error {
 }
 
 /// Adds what can be changed in this program to the errors of Vulkan compute.
+#[cfg(feature = "gpu")]
 impl From<gpu::error::Error> for Error {
     fn from(error: gpu::error::Error) -> Error {
         use gpu::error::Error as Gpu;

@@ -1,10 +1,10 @@
 //! Runs from pictures, such as exports of a viewer: a folder of frames or a file of several pages per view, with a geometry that
 //! the user states.
 
+use crate::dicom::{PixelRange, Relationship, Run};
 use crate::error::{Error, Result};
 use crate::formats::frames::{self, GreyFrame};
 use crate::geometry::{CArm, Geometry};
-use crate::import::dicom::{PixelRange, Relationship, Run};
 use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 

@@ -1,10 +1,10 @@
 //! Geometry, times and phases of views of pictures, from a TOML file that the user writes.
 
+use crate::angiograms::Gating;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::geometry::{CArm, Geometry};
-use crate::import::angiograms::Gating;
-use crate::import::pictures::PictureView;
+use crate::pictures::PictureView;
 use crate::scan::gating::RPeaks;
 use serde::Deserialize;
 use std::path::{Path, PathBuf};

@@ -1,6 +1,6 @@
 //! Identity of a run's file, for an import that keeps references.
 
-use crate::import::reader::Reader;
+use crate::reader::Reader;
 use crate::scan::references::{SourceImage, SourceStudy, is_uid};
 use dicom_core::Tag;
 use dicom_dictionary_std::tags;

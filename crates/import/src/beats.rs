@@ -1,6 +1,6 @@
 //! Choice among the beats of a run: frames of one phase from two beats show each vessel twice where the patient breathes.
 
-use crate::import::image_beat::vessels;
+use crate::image_beat::vessels;
 use crate::raster::{Image, opening, percentile};
 use crate::scan::gating::{BeatTime, RPeaks};
 use rayon::prelude::*;

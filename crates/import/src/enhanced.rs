@@ -2,9 +2,9 @@
 
 use crate::error::Result;
 use crate::geometry::CArm;
-use crate::import::reader::Reader;
-use crate::import::stated::StatedGeometry;
+use crate::reader::Reader;
 use crate::scan::gating::RPeaks;
+use crate::stated::StatedGeometry;
 use dicom_core::Tag;
 use dicom_dictionary_std::tags;
 

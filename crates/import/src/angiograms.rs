@@ -1,14 +1,14 @@
 //! DICOM runs -> a dataset: selects frames, assigns phases and crops to the open area of the collimator.
 
+use crate::dicom::{PixelRange, Relationship, Run};
 use crate::error::{Error, Result};
 use crate::geometry::CArm;
-use crate::import::dicom::{PixelRange, Relationship, Run};
-use crate::import::stands::stands;
-use crate::import::{beats, image_beat};
 use crate::raster::Image;
 use crate::scan::at_rest::{WIDEST_VESSEL_MM, vessel_pixels, without_vessels};
 use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
 use crate::scan::references::ReferencedRun;
+use crate::stands::stands;
+use crate::{beats, image_beat};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;

@@ -1,7 +1,7 @@
 //! Times of the frames of a run.
 
 use crate::error::Result;
-use crate::import::reader::Reader;
+use crate::reader::Reader;
 use dicom_core::Tag;
 use dicom_dictionary_std::tags;
 

@@ -24,7 +24,7 @@ impl Dataset {
     /// the image, in all images of a view, in regions that touch the border of the image; the pixels next to these regions are
     /// partly hidden. Training images are filled there with the nearest visible value, so that a blade is not taken for tissue.
     /// All pixels of the canvas beyond an image are hidden.
-    pub(crate) fn hide(&mut self) {
+    pub fn hide(&mut self) {
         for view in 0..self.views.len() {
             let of_view = self.frames.iter().filter(|f| f.view == view);
             let images: Vec<Cow<'_, [f32]>> = of_view.map(|f| self.own(view, &f.integrals)).collect();

@@ -92,12 +92,12 @@ pub(crate) fn binned_series(dataset: &Dataset) -> Vec<Series> {
 }
 
 /// Returns the training frames of a dataset, binned as for [`Observed`].
-pub(crate) fn coarsened_for_calibration(dataset: &Dataset) -> Dataset {
+pub fn coarsened_for_calibration(dataset: &Dataset) -> Dataset {
     coarsened(dataset, factor(dataset))
 }
 
 /// Returns the training frames of a dataset, binned as far as the smaller side of each image keeps `min_side` pixels.
-pub(crate) fn binned_to(dataset: &Dataset, min_side: usize) -> Dataset {
+pub fn binned_to(dataset: &Dataset, min_side: usize) -> Dataset {
     let sides = dataset.training_views().into_iter().flat_map(|view| dataset.views[view].size);
     coarsened(dataset, (sides.min().unwrap_or(0) / min_side).max(1))
 }
@@ -294,7 +294,7 @@ impl Observed {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::selftest::problems::small_dataset;
+    use crate::scan::small::small_dataset;
     use glam::DVec3;
 
     #[test]

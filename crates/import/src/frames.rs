@@ -1,8 +1,8 @@
 //! Pixel data: which fragments belong to which frame, and the values of frames as they are stored.
 
+use crate::codecs::{Codec, native};
+use crate::elements::{DataSet, Element, Fragments, Value, numbers};
 use crate::formats::decoders;
-use crate::import::codecs::{Codec, native};
-use crate::import::elements::{DataSet, Element, Fragments, Value, numbers};
 use dicom_core::VR;
 use dicom_dictionary_std::tags;
 use rayon::prelude::*;

@@ -1,7 +1,7 @@
 //! Values of a data set by their tags, with errors that name file and tag.
 
+use crate::elements::{DataSet, Element, Value};
 use crate::error::{Error, Result};
-use crate::import::elements::{DataSet, Element, Value};
 use dicom_core::Tag;
 use std::path::Path;
 

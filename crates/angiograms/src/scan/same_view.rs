@@ -8,12 +8,12 @@ use glam::DVec3;
 
 /// Distance below which two geometries are those of one view, pixels: the largest between their projections of points of the
 /// heart.
-pub(crate) const SAME_VIEW_PX: f64 = 0.1;
+pub const SAME_VIEW_PX: f64 = 0.1;
 /// Half side of a cube around the isocentre that represents the heart, mm.
 const HEART_MM: f64 = 50.0;
 
 /// Tells whether two geometries of images of one size are those of one view.
-pub(crate) fn agree(a: &ViewRays, b: &ViewRays) -> bool {
+pub fn agree(a: &ViewRays, b: &ViewRays) -> bool {
     let sign = |k: usize, axis: usize| if k >> axis & 1 == 1 { HEART_MM } else { -HEART_MM };
     let mut corners = (0..8).map(|k| world_from_lps_mm(DVec3::new(sign(k, 0), sign(k, 1), sign(k, 2))));
     a == b
@@ -25,7 +25,7 @@ pub(crate) fn agree(a: &ViewRays, b: &ViewRays) -> bool {
 /// Returns the index of the view of images of `size` (columns, rows): the first one that agrees with `geometry`, or a new one at
 /// the end of the list. The source must lie outside the searched depth range, which begins `depth_before` world units before the
 /// isocentre.
-pub(crate) fn find_or_add(
+pub fn find_or_add(
     views: &mut Vec<View>,
     geometry: Geometry,
     size: [usize; 2],

@@ -13,14 +13,14 @@ pub const PHASES: u32 = 2;
 const NOISE_SIGMAS: f32 = 4.0;
 
 /// Returns half the width of the widest vessel, in pixels of `pixel_mm` at the isocentre.
-pub(crate) fn vessel_pixels(pixel_mm: f64) -> usize {
+pub fn vessel_pixels(pixel_mm: f64) -> usize {
     ((0.5 * WIDEST_VESSEL_MM / pixel_mm).ceil() as usize).max(2)
 }
 
 /// Removes structures as thin as vessels from an image of line integrals: pixels that stand out of their surroundings by more
 /// than noise are set to the level of the surroundings. `vessel` is half the width of the widest vessel, in pixels; areas of at
 /// least `dark` belong to the collimator or the detector's rim, whose outlines are as thin as vessels.
-pub(crate) fn without_vessels(image: &Image, vessel: usize, dark: f32) -> Image {
+pub fn without_vessels(image: &Image, vessel: usize, dark: f32) -> Image {
     let mut background = opening(image, vessel);
     let stand_out: Vec<f32> = image.values.iter().zip(&background.values).map(|(v, b)| v - b).collect();
     // An opening follows the minimum of the surroundings, which noise makes too small; the median difference corrects for that.
@@ -36,7 +36,7 @@ pub(crate) fn without_vessels(image: &Image, vessel: usize, dark: f32) -> Image 
 
 /// Adds a training frame of phase 1 for each view of an object at rest that has none: the mean of its images without structures as
 /// thin as vessels. The frames have the sizes of their views. Returns a note if there are such views.
-pub(crate) fn add_appearance_without_vessels(views: &[View], frames: &mut Vec<Frame>) -> Option<String> {
+pub fn add_appearance_without_vessels(views: &[View], frames: &mut Vec<Frame>) -> Option<String> {
     let mut made = 0;
     for (index, view) in views.iter().enumerate() {
         let of_view = |phase: u32| {

@@ -1,17 +1,17 @@
 //! Reads an X-ray angiography run from a DICOM file: frames, geometry, times, ECG. Nothing that identifies a patient is kept.
 
+use crate::codecs::Codec;
+use crate::elements::{self, Content, numbers};
+use crate::enhanced::{self, Groups};
 use crate::error::{Error, Result};
 use crate::fingerprint::Fingerprint;
+use crate::frames::{self, Layout};
 use crate::geometry::CArm;
-use crate::import::codecs::Codec;
-use crate::import::elements::{self, Content, numbers};
-use crate::import::enhanced::{self, Groups};
-use crate::import::frames::{self, Layout};
-use crate::import::reader::Reader;
-use crate::import::stated::StatedGeometry;
-use crate::import::{timing, traces};
+use crate::reader::Reader;
 use crate::scan::gating::RPeaks;
 use crate::scan::references::SourceImage;
+use crate::stated::StatedGeometry;
+use crate::{timing, traces};
 use dicom_core::{Tag, VR};
 use dicom_dictionary_std::tags;
 use std::ops::Range;

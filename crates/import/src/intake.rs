@@ -1,11 +1,10 @@
 //! Accepts runs, together or one after the other, and checks them against each other.
 
+use crate::angiograms::{Gating, ImportOptions, Prepared, TakenFrame};
+use crate::dicom::Run;
 use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT};
-use crate::import::angiograms::{Gating, ImportOptions, Prepared, TakenFrame};
-use crate::import::dicom::Run;
-use crate::import::pictures::{self, PictureView, PixelMeaning};
-use crate::import::stated::StatedGeometry;
+use crate::pictures::{self, PictureView, PixelMeaning};
 use crate::scan::at_rest;
 use crate::scan::canvas::in_words;
 use crate::scan::dataset::{Layout, Split};
@@ -13,6 +12,7 @@ use crate::scan::frame_checks::{check_values, checked_view};
 use crate::scan::references::{REFERENCES, ReferencedImage, ReferencedRun, References};
 use crate::scan::same_view::find_or_add;
 use crate::scan::writer::{About, Writer};
+use crate::stated::StatedGeometry;
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 

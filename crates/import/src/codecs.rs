@@ -1,7 +1,7 @@
 //! Transfer syntaxes, and images as they compress them: one frame of grey values at a time.
 
+use crate::elements::syntax;
 use crate::formats::decoders::caught;
-use crate::import::elements::syntax;
 use hayro_jpeg2000::{DecodeSettings, DecoderContext, Image};
 use jpeg_decoder::{Decoder, PixelFormat, UnsupportedFeature};
 

@@ -4,23 +4,24 @@ use crate::geometry::{Geometry, MM_PER_UNIT};
 use crate::scan::dataset::View;
 
 /// Problem with a frame.
-pub(crate) struct Complaint {
+pub struct Complaint {
     /// Field of the frame.
-    pub(crate) field: String,
+    pub field: String,
     /// Value of the field.
-    pub(crate) value: String,
+    pub value: String,
     /// Explanation why the value is not accepted.
-    pub(crate) problem: String,
+    pub problem: String,
 }
 
 impl Complaint {
-    pub(crate) fn new(field: &str, value: impl ToString, problem: impl ToString) -> Complaint {
+    /// Makes a complaint about a field.
+    pub fn new(field: &str, value: impl ToString, problem: impl ToString) -> Complaint {
         Complaint { field: field.into(), value: value.to_string(), problem: problem.to_string() }
     }
 }
 
 /// Rejects values that are not finite and names the pixel.
-pub(crate) fn check_values(values: &[f32], width: usize) -> Result<(), Complaint> {
+pub fn check_values(values: &[f32], width: usize) -> Result<(), Complaint> {
     match values.iter().position(|v| !v.is_finite()) {
         Some(at) => {
             let pixel = format!("column {}, row {}", at % width, at / width);
@@ -31,7 +32,7 @@ pub(crate) fn check_values(values: &[f32], width: usize) -> Result<(), Complaint
 }
 
 /// Rejects a time, counted in phases, outside the beat.
-pub(crate) fn check_phase(time_phases: f64, n_phases: u32) -> Result<(), Complaint> {
+pub fn check_phase(time_phases: f64, n_phases: u32) -> Result<(), Complaint> {
     if (0.0..f64::from(n_phases)).contains(&time_phases) {
         return Ok(());
     }
@@ -44,7 +45,7 @@ pub(crate) fn check_phase(time_phases: f64, n_phases: u32) -> Result<(), Complai
 
 /// Makes a view of images of `size` (columns, rows) and checks that its source lies outside the searched depth range, which
 /// begins `depth_before` world units before the isocentre.
-pub(crate) fn checked_view(geometry: Geometry, size: [usize; 2], depth_before: f64) -> Result<View, Complaint> {
+pub fn checked_view(geometry: Geometry, size: [usize; 2], depth_before: f64) -> Result<View, Complaint> {
     let view = View::new(geometry, size).map_err(|(field, problem)| Complaint::new(&field, "", problem))?;
     if view.rays.sod <= depth_before {
         let problem =

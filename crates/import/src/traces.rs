@@ -1,9 +1,9 @@
 //! ECG traces of a run: channels of its waveforms, and curves of the retired groups 50xx.
 
+use crate::ecg;
+use crate::elements::numbers;
 use crate::error::{Error, Result};
-use crate::import::ecg;
-use crate::import::elements::numbers;
-use crate::import::reader::Reader;
+use crate::reader::Reader;
 use crate::scan::gating::RPeaks;
 use dicom_core::Tag;
 use dicom_dictionary_std::tags;
