@@ -15,7 +15,7 @@ use nertca_vk::model::component::Component;
 use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk::score::metrics::best_dice;
-use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions};
+use nertca_vk_runs::session::{FrameTime, NewFrame, Session, SessionOptions};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};

@@ -30,20 +30,9 @@
 //!
 //! let gpu = Gpu::open(&DeviceOptions::default())?;
 //! # let directory = tempfile::tempdir().unwrap();
-//! # let (data, out) = (directory.path().join("phantom"), directory.path());
-//! # let options = nertca_vk::phantom::dataset::PhantomOptions {
-//! #     setting: nertca_vk::phantom::dataset::Setting::SmallXcat,
-//! #     size: 32,
-//! #     phases: 4,
-//! #     views: nertca_vk::phantom::views::ViewAngles::published(3)?,
-//! #     seed: 1,
-//! #     stenoses: Vec::new(),
-//! #     degradations: Default::default(),
-//! #     layout: nertca_vk::scan::dataset::Layout::Native,
-//! #     anatomy: None,
-//! #     volumes_every: None,
-//! # };
-//! # nertca_vk::phantom::dataset::make(&gpu, &options, &data, |_, _, _| ())?;
+//! # let (data, out) = (directory.path().join("data"), directory.path());
+//! # let small = nertca_vk::scan::small::small_dataset(32, 32, 4)?;
+//! # nertca_vk::scan::writer::convert(&small, nertca_vk::scan::dataset::Layout::Native, &data, "small".into())?;
 //! let dataset = Dataset::open(&data)?;
 //! let config = Config::preset(Preset::Fast);
 //! # let config = Config::load(Some(Preset::Fast), None, &["train.iterations=20".into()])?;
@@ -249,24 +238,6 @@ pub mod phantom {
     pub mod views;
     pub mod voxels;
 }
-
-/// One run, from a dataset to a run directory.
-pub mod run {
-    mod curve;
-    pub mod events;
-    pub mod history;
-    pub mod hull_pictures;
-    pub mod info;
-    mod log;
-    pub mod prior;
-    pub mod reconstruct;
-    pub mod score;
-    pub mod silhouette_pictures;
-    mod snapshots;
-    pub mod tree_score;
-}
-
-pub mod session;
 
 pub mod bench;
 

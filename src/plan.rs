@@ -60,7 +60,7 @@ impl Plan {
     }
 
     /// Returns the number of fits whose mean the field of a configuration is, for the data of this plan.
-    pub(crate) fn fits(&self, config: &Config) -> u32 {
+    pub fn fits(&self, config: &Config) -> u32 {
         self.data.as_ref().map_or(1, |data| data.fits(config))
     }
 

@@ -22,8 +22,8 @@ use nertca_vk::scan::small;
 pub use nertca_vk::selftest::compare::relative_error;
 use nertca_vk::selftest::compare::{Findings, Row};
 use nertca_vk::selftest::problems;
-use nertca_vk::session::{FrameTime, NewFrame, Session};
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_runs::session::{FrameTime, NewFrame, Session};
 use std::num::NonZeroU32;
 use std::path::Path;
 

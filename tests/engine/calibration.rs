@@ -16,8 +16,8 @@ use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::scan::writer;
 use nertca_vk::score::calibrated::in_calibrated_frame;
 use nertca_vk::score::eval::evaluate;
-use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions};
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_runs::session::{FrameTime, NewFrame, Session, SessionOptions};
 use std::time::Instant;
 
 fn config(mode: &str) -> Config {

@@ -14,8 +14,8 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split};
 use nertca_vk::score::eval::evaluate;
-use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions};
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_runs::session::{FrameTime, NewFrame, Session, SessionOptions};
 
 const PHASES: u32 = 10;
 /// Iterations of Gaussians; a continued fit skips the first third.

@@ -4,10 +4,10 @@ use crate::common::{expect_silence, gpu, small_config, small_dataset, tuning};
 use nertca_vk::error::Error;
 use nertca_vk::model::Model;
 use nertca_vk::plan::Plan;
-use nertca_vk::run::events::Event;
-use nertca_vk::run::score::{ScoreOptions, evaluate_model};
 use nertca_vk::scan::dataset::{Dataset, Split};
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_runs::run::events::Event;
+use nertca_vk_runs::run::score::{ScoreOptions, evaluate_model};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// A dataset with one validation view of three images.

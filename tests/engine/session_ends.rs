@@ -2,7 +2,7 @@
 //! takes to exit.
 
 use crate::common::{add_training_frames, expect_silence, gpu, small_config, small_dataset, tuning};
-use nertca_vk::session::{Session, SessionOptions, State};
+use nertca_vk_runs::session::{Session, SessionOptions, State};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;

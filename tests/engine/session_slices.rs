@@ -7,7 +7,7 @@ use nertca_vk::model::component::Component;
 use nertca_vk::render::grid::PatientGrid;
 use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::scan::dataset::{Dataset, Split};
-use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions};
+use nertca_vk_runs::session::{FrameTime, NewFrame, Session, SessionOptions};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::mpsc::channel;

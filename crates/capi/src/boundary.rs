@@ -2,7 +2,7 @@
 
 use crate::status::{Failure, NERTCA_ERROR_INTERNAL, NERTCA_OK, Outcome, copy_text, nertca_status};
 use crate::{callsites, handles};
-use nertca_vk::session::TRAINING_THREAD;
+use nertca_vk_runs::session::TRAINING_THREAD;
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
 use std::ffi::{c_char, c_void};

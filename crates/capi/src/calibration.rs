@@ -6,7 +6,7 @@ use crate::types::{nertca_correction, nertca_geometry, read, write};
 use nertca_vk::calibrate::choose::Correction;
 use nertca_vk::error::Result;
 use nertca_vk::geometry::Geometry;
-use nertca_vk::session::{FrameUse, Session};
+use nertca_vk_runs::session::{FrameUse, Session};
 
 /// The stated geometry of the frame is used.
 pub const NERTCA_CORRECTION_STATED: u32 = 0;

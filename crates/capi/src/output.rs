@@ -17,7 +17,7 @@ use nertca_vk::gpu::buffer::Buffer;
 use nertca_vk::model::component::Component;
 use nertca_vk::render::grid::PatientGrid;
 use nertca_vk::render::quantity::{Projection, Quantity};
-use nertca_vk::session::Drawn;
+use nertca_vk_runs::session::Drawn;
 use std::sync::Arc;
 
 /// A buffer in device memory that other APIs and processes can import.

@@ -3,7 +3,7 @@
 use crate::reconstruction::{nertca_reconstruction, on_reconstruction};
 use crate::status::{Failure, nertca_status};
 use crate::types::{NERTCA_STATE_RUNNING, nertca_progress, nertca_progress_callback};
-use nertca_vk::session::Progress;
+use nertca_vk_runs::session::Progress;
 use std::ffi::c_void;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;

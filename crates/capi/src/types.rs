@@ -3,7 +3,7 @@
 use crate::status::{Failure, Outcome};
 use nertca_vk::geometry::{CArm, Geometry, Matrix};
 use nertca_vk::scan::dataset::{Intensity, Split};
-use nertca_vk::session::{FrameTime, NewFrame, State};
+use nertca_vk_runs::session::{FrameTime, NewFrame, State};
 use std::ffi::{c_char, c_void};
 
 /// Unsigned 8-bit pixels.

@@ -8,9 +8,9 @@ use nertca_vk::calibrate::calibrate;
 use nertca_vk::calibrate::settings::{CalibrateMode, CalibrateSettings};
 use nertca_vk::error::Result;
 use nertca_vk::files;
-use nertca_vk::run::silhouette_pictures;
 use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::scan::writer;
+use nertca_vk_runs::run::silhouette_pictures;
 use std::path::PathBuf;
 
 /// Arguments of `calibrate`.

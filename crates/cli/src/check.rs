@@ -7,8 +7,8 @@ use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use nertca_vk::plan::Plan;
-use nertca_vk::run::hull_pictures;
 use nertca_vk::scan::dataset::Dataset;
+use nertca_vk_runs::run::hull_pictures;
 use std::path::PathBuf;
 
 /// Arguments of `check`.

@@ -4,7 +4,7 @@ use super::stdout::printable;
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::fitting::losses::LargeLoss;
-use nertca_vk::run::events::Event;
+use nertca_vk_runs::run::events::Event;
 use std::io::IsTerminal;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -8,12 +8,12 @@ use nertca_vk::error::{Error, Result};
 use nertca_vk::files::{self, Lock};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::tuning::Tuning;
-use nertca_vk::run::info::RunInfo;
-use nertca_vk::run::score::as_trained;
 use nertca_vk::scan::dataset::Dataset;
-use nertca_vk::session::Session;
 use nertca_vk::train::trainer::data_fingerprint;
 use nertca_vk_import::intake::Intake;
+use nertca_vk_runs::run::info::RunInfo;
+use nertca_vk_runs::run::score::as_trained;
+use nertca_vk_runs::session::Session;
 use std::path::{Path, PathBuf};
 
 /// Name of the dataset of the runs that were read, inside the run directory.

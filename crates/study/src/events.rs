@@ -1,6 +1,6 @@
 //! Events that a study reports to its observer.
 
-use nertca_vk::run::events::Event;
+use nertca_vk_runs::run::events::Event;
 use serde::Serialize;
 
 /// Event of a study; also a line of `study run --json`, whose kind is the value of `study`.
