@@ -240,25 +240,3 @@ pub mod phantom {
 }
 
 pub mod bench;
-
-/// Reference implementations of the compute stages in f64: plain loops, no device. They serve tests and `selftest`; no result
-/// depends on them.
-pub mod reference {
-    pub mod adam;
-    pub mod blobs;
-    pub mod field;
-    pub mod gaussians;
-    pub mod losses;
-    pub mod march;
-    pub mod maxima;
-    pub mod networks;
-    pub mod occupancy;
-    pub mod projector;
-    pub mod ssim;
-    pub mod step;
-}
-
-#[cfg(feature = "diagnostics")]
-pub mod inventory;
-#[cfg(feature = "diagnostics")]
-pub mod selftest;

@@ -22,8 +22,6 @@ mod pruning;
 pub mod remainder;
 mod repeated;
 pub mod seeds;
-#[cfg(feature = "diagnostics")]
-pub mod selftest;
 pub mod setup;
 pub mod shared_images;
 pub mod soft_hull;
@@ -35,7 +33,6 @@ pub mod targets;
 #[cfg(test)]
 mod test_targets;
 pub mod trainer;
-pub mod twin;
 mod unseen;
 
 use crate::config::method::MethodKind;

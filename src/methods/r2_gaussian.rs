@@ -6,17 +6,12 @@ pub mod densify;
 pub mod fdk;
 pub mod parameters;
 pub mod particles;
-#[cfg(feature = "diagnostics")]
-pub mod selftest;
 pub mod setup;
 pub mod stages;
 pub mod start;
 pub mod state;
 mod tensors;
 pub mod trainer;
-pub mod twin;
-pub mod twin_chords;
-pub(crate) mod twin_shape;
 
 use crate::config::method::MethodKind;
 use crate::config::{Config, StaticData};

@@ -8,14 +8,11 @@ pub mod field;
 mod interface;
 pub mod lineformer;
 pub mod products;
-#[cfg(feature = "diagnostics")]
-pub mod selftest;
 pub mod setup;
 pub mod stages;
 pub mod start;
 mod tensors;
 pub mod trainer;
-pub mod twin;
 
 use crate::config::method::MethodKind;
 use crate::config::{Config, StaticData};

@@ -4,15 +4,12 @@
 pub mod data;
 pub mod densify;
 pub mod particles;
-#[cfg(feature = "diagnostics")]
-pub mod selftest;
 pub mod setup;
 pub mod stages;
 pub mod start;
 pub mod state;
 mod tensors;
 pub mod trainer;
-pub mod twin;
 
 use crate::config::method::MethodKind;
 use crate::config::{Config, StaticData};

@@ -186,7 +186,7 @@ impl Builder<'_> {
 }
 
 /// Tells whether the backward passes recompute the encoding and the first layer of such a network.
-pub(crate) fn computes_again(tuning: &MatrixTuning, params: &NetworkMap) -> bool {
+pub fn computes_again(tuning: &MatrixTuning, params: &NetworkMap) -> bool {
     tuning.recompute && recomputes(&spans(&params.layers, tuning.pairs))
 }
 

@@ -376,7 +376,7 @@ impl Renderer {
     ///
     /// # Errors
     /// As [`Renderer::render`]; [`Error::Internal`] where a network is the dynamic field.
-    pub(crate) fn show_gaussians_into(
+    pub fn show_gaussians_into(
         &self,
         target: &Buffer,
         rays: &ViewRays,

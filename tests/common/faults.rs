@@ -7,7 +7,7 @@ use nertca_vk::error::Result;
 use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::stages::kernel_code;
-use nertca_vk::selftest::compare::Findings;
+use nertca_vk_twins::selftest::compare::Findings;
 
 const CONSTANT: u32 = 43;
 const STORE: u32 = 62;

@@ -19,11 +19,11 @@ use nertca_vk::phantom::views::ViewAngles;
 use nertca_vk::random::{STREAM_PHOTON, normal};
 use nertca_vk::scan::dataset::{Dataset, Layout, Split};
 use nertca_vk::scan::small;
-pub use nertca_vk::selftest::compare::relative_error;
-use nertca_vk::selftest::compare::{Findings, Row};
-use nertca_vk::selftest::problems;
 use nertca_vk::train::trainer::Trainer;
 use nertca_vk_runs::session::{FrameTime, NewFrame, Session};
+pub use nertca_vk_twins::selftest::compare::relative_error;
+use nertca_vk_twins::selftest::compare::{Findings, Row};
+use nertca_vk_twins::selftest::problems;
 use std::num::NonZeroU32;
 use std::path::Path;
 

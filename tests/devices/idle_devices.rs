@@ -6,12 +6,12 @@ use crate::shim;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
-use nertca_vk::methods::r2_gaussian::selftest as r2;
-use nertca_vk::methods::sax_nerf::selftest as sax;
-use nertca_vk::methods::x_gaussian::selftest as x_gaussian;
 use nertca_vk::plan::Plan;
-use nertca_vk::selftest::problems;
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_twins::selftest::problems;
+use nertca_vk_twins::selftest::r2_gaussian as r2;
+use nertca_vk_twins::selftest::sax_nerf as sax;
+use nertca_vk_twins::selftest::x_gaussian;
 
 fn open() -> Gpu {
     Gpu::open(&DeviceOptions { loader: Some(shim::loader()), ..DeviceOptions::default() }).unwrap()

@@ -9,12 +9,12 @@ use nertca_vk::error::Result;
 use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::tuning::{Layers, Tuning};
-use nertca_vk::methods::sax_nerf::selftest as sax;
 use nertca_vk::plan::Plan;
-use nertca_vk::selftest::compare::Findings;
-use nertca_vk::selftest::iteration::{self, F32_CASES};
-use nertca_vk::selftest::problems;
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_twins::selftest::compare::Findings;
+use nertca_vk_twins::selftest::iteration::{self, F32_CASES};
+use nertca_vk_twins::selftest::problems;
+use nertca_vk_twins::selftest::sax_nerf as sax;
 
 fn open(without_subgroups: bool, without_int64_atomics: bool) -> Gpu {
     let options = DeviceOptions {

@@ -13,11 +13,11 @@ use nertca_vk::kernels::layout::DeviceState;
 use nertca_vk::kernels::stages::{has_matrix_kernels, kernel_code, matrix_shape, why_no_matrices};
 use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};
 use nertca_vk::plan::Plan;
-use nertca_vk::selftest::compare::Findings;
-use nertca_vk::selftest::drawing;
-use nertca_vk::selftest::iteration::{self, Case, MATRIX_CASES, MATRIX_CASES_BETWEEN_PHASES};
 use nertca_vk::train::calibrate::{self, Verdict};
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_twins::selftest::compare::Findings;
+use nertca_vk_twins::selftest::drawing;
+use nertca_vk_twins::selftest::iteration::{self, Case, MATRIX_CASES, MATRIX_CASES_BETWEEN_PHASES};
 
 /// Says that a test checks nothing, which `NERTCA_MATRICES=require` forbids.
 fn skip(why: &str) {

@@ -17,13 +17,13 @@ use nertca_vk::kernels::push;
 use nertca_vk::kernels::stages::{Build, Stage};
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::methods::dynamic_gaussians::deformable::DeformableTrainer;
-use nertca_vk::methods::dynamic_gaussians::selftest as deformable;
-use nertca_vk::methods::sax_nerf::selftest as sax;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::small;
-use nertca_vk::selftest::{drawing, gaussians, problems, repeats};
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_twins::selftest::dynamic_gaussians as deformable;
+use nertca_vk_twins::selftest::sax_nerf as sax;
+use nertca_vk_twins::selftest::{drawing, gaussians, problems, repeats};
 
 /// Minimum requirements of Vulkan 1.2, except for the storage buffers of a kernel.
 const LEAST: Poor = Poor {

@@ -10,19 +10,19 @@ use nertca_vk::config::{Config, Preset, sections::Train};
 use nertca_vk::error::Result;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::gpu::statistics::PipelineStatistics;
-use nertca_vk::inventory::{self, Compiled};
 use nertca_vk::kernels::tuning::{Layers, Tuning};
-use nertca_vk::methods::dynamic_gaussians::selftest as deformable;
-use nertca_vk::methods::r2_gaussian::selftest as r2;
-use nertca_vk::methods::sax_nerf::selftest as sax;
-use nertca_vk::methods::x_gaussian::selftest as x_gaussian;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::small;
-use nertca_vk::selftest::compare::Findings;
-use nertca_vk::selftest::iteration::F32_CASES;
-use nertca_vk::selftest::{blobs, gaussians, iteration, networks};
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_twins::inventory::{self, Compiled};
+use nertca_vk_twins::selftest::compare::Findings;
+use nertca_vk_twins::selftest::dynamic_gaussians as deformable;
+use nertca_vk_twins::selftest::iteration::F32_CASES;
+use nertca_vk_twins::selftest::r2_gaussian as r2;
+use nertca_vk_twins::selftest::sax_nerf as sax;
+use nertca_vk_twins::selftest::x_gaussian;
+use nertca_vk_twins::selftest::{blobs, gaussians, iteration, networks};
 use std::collections::BTreeSet;
 
 fn an_iteration(gpu: &Gpu, findings: &mut Findings) -> Result<()> {

@@ -21,10 +21,10 @@ use nertca_vk::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use nertca_vk::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use nertca_vk::methods::dynamic_gaussians::targets::Targets;
 use nertca_vk::plan::Plan;
-use nertca_vk::reference::gaussians::{params, project};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::train::trainer::Trainer;
 use nertca_vk_runs::session::{Progress, Session, SessionOptions, State};
+use nertca_vk_twins::reference::gaussians::{params, project};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 

@@ -12,8 +12,8 @@ use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout, Split};
 use nertca_vk::scan::gating::BeatTime;
 use nertca_vk::scan::writer;
-use nertca_vk::selftest::blobs;
-use nertca_vk::selftest::problems::drawn_fields;
+use nertca_vk_twins::selftest::blobs;
+use nertca_vk_twins::selftest::problems::drawn_fields;
 use serde_json::Value;
 use std::path::Path;
 

@@ -7,10 +7,10 @@ use crate::golden_file::Golden;
 use nertca_vk::config::Preset;
 use nertca_vk::fields::data::FieldData;
 use nertca_vk::plan::Plan;
-use nertca_vk::reference::field::Precision;
-use nertca_vk::reference::{losses, march, step};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_twins::reference::field::Precision;
+use nertca_vk_twins::reference::{losses, march, step};
 
 fn check(preset: Preset, name: &str) {
     let golden = Golden::open(name, "tools/reference.py");

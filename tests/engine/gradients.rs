@@ -6,9 +6,9 @@ use glam::DVec3;
 use nertca_vk::fields::data::FieldData;
 use nertca_vk::plan::Plan;
 use nertca_vk::random;
-use nertca_vk::reference::field::{self, Precision};
-use nertca_vk::reference::{march, step};
-use nertca_vk::selftest::networks::LARGE;
+use nertca_vk_twins::reference::field::{self, Precision};
+use nertca_vk_twins::reference::{march, step};
+use nertca_vk_twins::selftest::networks::LARGE;
 
 fn plan(preset: &str, settings: &[&str]) -> FieldData {
     let plan = Plan::new(&small_config(preset, settings), &uneven_dataset(9, 8)).unwrap();

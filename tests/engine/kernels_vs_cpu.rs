@@ -7,11 +7,11 @@ use nertca_vk::gpu::record::Recording;
 use nertca_vk::kernels::layout::Ray;
 use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};
 use nertca_vk::plan::Plan;
-use nertca_vk::reference::field::Precision;
-use nertca_vk::reference::{march, step};
-use nertca_vk::selftest::iteration::{self, F32_CASES};
-use nertca_vk::selftest::occupancy;
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_twins::reference::field::Precision;
+use nertca_vk_twins::reference::{march, step};
+use nertca_vk_twins::selftest::iteration::{self, F32_CASES};
+use nertca_vk_twins::selftest::occupancy;
 
 #[test]
 fn barriers_follow_from_what_commands_touch() {

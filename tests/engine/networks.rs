@@ -16,8 +16,8 @@ use nertca_vk::render::grid::Grid;
 use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
-use nertca_vk::selftest::{drawing, networks};
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_twins::selftest::{drawing, networks};
 use std::sync::Arc;
 
 /// Paths of a device: as for an old lavapipe, as for GPUs, and matrices where available.

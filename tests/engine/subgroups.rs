@@ -5,9 +5,9 @@ use crate::common::{expect_agreement, expect_silence, tuning, uneven_dataset};
 use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::tuning::Tuning;
-use nertca_vk::methods::dynamic_gaussians::selftest as deformable;
-use nertca_vk::selftest::iteration::{self, F32_CASES};
-use nertca_vk::selftest::{gaussians, repeats};
+use nertca_vk_twins::selftest::dynamic_gaussians as deformable;
+use nertca_vk_twins::selftest::iteration::{self, F32_CASES};
+use nertca_vk_twins::selftest::{gaussians, repeats};
 
 fn open(without_subgroups: bool) -> Gpu {
     Gpu::open(&DeviceOptions { validation: true, statistics: true, without_subgroups, ..DeviceOptions::default() })

@@ -15,21 +15,21 @@ use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::{Gaussian, GaussianSetup};
 use nertca_vk::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use nertca_vk::methods::dynamic_gaussians::per_phase::GaussianTrainer;
-use nertca_vk::methods::dynamic_gaussians::selftest;
 use nertca_vk::methods::dynamic_gaussians::setup;
 use nertca_vk::methods::dynamic_gaussians::shared_images::SharedImages;
 use nertca_vk::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use nertca_vk::methods::dynamic_gaussians::targets::Targets;
-use nertca_vk::methods::dynamic_gaussians::twin::{DeformableParams, loss_and_gradient};
-use nertca_vk::reference::gaussians::{self as reference, N_PARAMS, Params, params};
-use nertca_vk::reference::maxima::maxima;
 use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk::score::metrics;
-use nertca_vk::selftest::gaussians::{self, TENSORS, device_gradient, numbers, twin};
-use nertca_vk::selftest::problems::{
+use nertca_vk::vessels::threshold::VESSEL_SHARE;
+use nertca_vk_twins::reference::dynamic_gaussians::{DeformableParams, loss_and_gradient};
+use nertca_vk_twins::reference::gaussians::{self as reference, N_PARAMS, Params, params};
+use nertca_vk_twins::reference::maxima::maxima;
+use nertca_vk_twins::selftest::dynamic_gaussians;
+use nertca_vk_twins::selftest::gaussians::{self, TENSORS, device_gradient, numbers, twin};
+use nertca_vk_twins::selftest::problems::{
     self, ANGLES_DEG, deformable_case, deformable_set, fillings, random_gaussians, units, with_gaussians,
 };
-use nertca_vk::vessels::threshold::VESSEL_SHARE;
 use std::time::Instant;
 
 /// The default configuration.
@@ -541,7 +541,7 @@ fn tree_twin_gradient_is_the_derivative_of_its_loss() {
 #[test]
 fn tree_kernels_match_their_twin() {
     let gpu = gpu();
-    expect_agreement(|findings| selftest::compare(&gpu, findings));
+    expect_agreement(|findings| dynamic_gaussians::compare(&gpu, findings));
     let (targets, rows, config) = deformable_case().unwrap();
     let trainer = DeformableTrainer::with(&gpu, targets.clone(), &config, &Particles::fresh(rows.clone())).unwrap();
     assert_eq!(trainer.deformable().unwrap().expand().rows.len(), rows.len() * targets.n_phases);

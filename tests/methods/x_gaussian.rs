@@ -15,16 +15,16 @@ use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::{R2Turn, XGaussian, XStatistics};
 use nertca_vk::methods::x_gaussian::data::XData;
 use nertca_vk::methods::x_gaussian::densify::densified;
-use nertca_vk::methods::x_gaussian::selftest::{TENSORS, compare, hard_case, numbers, small_config, twin, with_sets};
 use nertca_vk::methods::x_gaussian::setup::turns;
 use nertca_vk::methods::x_gaussian::start::first_state;
 use nertca_vk::methods::x_gaussian::state::XState;
 use nertca_vk::methods::x_gaussian::trainer::XTrainer;
-use nertca_vk::methods::x_gaussian::twin::{N_PARAMS, Params, params};
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_twins::reference::x_gaussian::{N_PARAMS, Params, params};
+use nertca_vk_twins::selftest::x_gaussian::{TENSORS, compare, hard_case, numbers, small_config, twin, with_sets};
 use std::sync::Arc;
 
 fn config(settings: &[&str]) -> Config {

@@ -3,7 +3,7 @@
 
 use crate::program::program;
 use crate::root::root;
-use nertca_vk::inventory::{Compiled, differences};
+use nertca_vk_twins::inventory::{Compiled, differences};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::process::{Command, Output};

@@ -6,7 +6,7 @@ use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
-use nertca_vk::inventory::{self, Compiled, GROWTH};
+use nertca_vk_twins::inventory::{self, Compiled, GROWTH};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 

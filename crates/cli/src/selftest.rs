@@ -4,8 +4,8 @@ use super::options::GlobalOptions;
 use clap::Args;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::capabilities::DeviceInfo;
-use nertca_vk::selftest::compare::Row;
-use nertca_vk::selftest::{self, Progress, Report};
+use nertca_vk_twins::selftest::compare::Row;
+use nertca_vk_twins::selftest::{self, Progress, Report};
 use serde::Serialize;
 use std::time::Instant;
 

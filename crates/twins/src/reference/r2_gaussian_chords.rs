@@ -5,8 +5,8 @@
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::GaussianSetup;
 use crate::methods::r2_gaussian::parameters::softplus;
-use crate::methods::r2_gaussian::twin_shape::{pixels_within, position, scale};
 use crate::reference::gaussians::{Params, axes};
+use crate::reference::r2_gaussian_shape::{pixels_within, position, scale};
 use glam::{DMat3, DVec2, DVec3};
 
 /// A Gaussian in a view, and the box of pixels whose rays pass within the cut.

@@ -12,7 +12,7 @@ use crate::kernels::stages::{Build, Stage};
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use crate::methods::dynamic_gaussians::filling::{FILLING_RATE, MIN_FILLING};
 use crate::methods::dynamic_gaussians::targets::Targets;
-use crate::methods::dynamic_gaussians::twin::{DeformableParams, loss_and_gradient, phases_shown, shown};
+use crate::reference::dynamic_gaussians::{DeformableParams, loss_and_gradient, phases_shown, shown};
 use crate::reference::gaussians::{self as reference, N_PARAMS, Params};
 use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::{

@@ -15,10 +15,10 @@ use crate::methods::sax_nerf::field::{SaxField, SaxState};
 use crate::methods::sax_nerf::setup::{drawing_setup, outline, schedule};
 use crate::methods::sax_nerf::start::first_params;
 use crate::methods::sax_nerf::trainer::SaxTrainer;
-use crate::methods::sax_nerf::twin::{self as reference, Lineformer};
 use crate::model::field::{FieldDrawing, Row};
 use crate::plan::Plan;
 use crate::random::{STREAM_JITTER, normal};
+use crate::reference::sax_nerf::{self as reference, Lineformer};
 use crate::scan::small::small_dataset;
 use crate::selftest::compare::{Findings, Tolerance, told};
 

@@ -3,20 +3,24 @@
 //!
 //! 1. [`problems`] are small, seeded, and need no file; [`compare`] keeps how far the device was off, a row per stage
 //! 2. [`iteration`], [`networks`], [`occupancy`] and [`drawing`] are about the two fields, on f32 layers and on matrices;
-//!    [`gaussians`] and [`blobs`] about Gaussians; methods have self-tests in their rooms,
+//!    [`gaussians`] and [`blobs`] about Gaussians; methods have files of their own,
 //!    [`projections`] about phantoms
 //! 3. [`repeats`] are runs that must come to the same bits
 
 pub mod blobs;
 pub mod compare;
 pub mod drawing;
+pub mod dynamic_gaussians;
 pub mod gaussians;
 pub mod iteration;
 pub mod networks;
 pub mod occupancy;
 pub mod problems;
 pub mod projections;
+pub mod r2_gaussian;
 pub mod repeats;
+pub mod sax_nerf;
+pub mod x_gaussian;
 
 use crate::config::Preset;
 use crate::error::{Error, Result};
@@ -24,7 +28,6 @@ use crate::gpu::device::Gpu;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages;
 use crate::kernels::tuning::{Layers, MatrixTuning, Tuning};
-use crate::methods;
 use crate::scan::dataset::Dataset;
 use crate::scan::small::{small_dataset, uneven_dataset};
 use compare::{Findings, Row};
@@ -133,13 +136,10 @@ fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuni
 fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<TestPart<'a>> {
     vec![
         ("Gaussians per phase".into(), Box::new(move |findings| gaussians::compare(gpu, findings))),
-        ("R2-Gaussian".into(), Box::new(move |findings| methods::r2_gaussian::selftest::compare(gpu, findings))),
-        ("X-Gaussian".into(), Box::new(move |findings| methods::x_gaussian::selftest::compare(gpu, findings))),
-        ("SAX-NeRF".into(), Box::new(move |findings| methods::sax_nerf::selftest::compare(gpu, findings))),
-        (
-            "a deformable set of Gaussians".into(),
-            Box::new(move |findings| methods::dynamic_gaussians::selftest::compare(gpu, findings)),
-        ),
+        ("R2-Gaussian".into(), Box::new(move |findings| r2_gaussian::compare(gpu, findings))),
+        ("X-Gaussian".into(), Box::new(move |findings| x_gaussian::compare(gpu, findings))),
+        ("SAX-NeRF".into(), Box::new(move |findings| sax_nerf::compare(gpu, findings))),
+        ("a deformable set of Gaussians".into(), Box::new(move |findings| dynamic_gaussians::compare(gpu, findings))),
         ("views of Gaussians".into(), Box::new(move |findings| blobs::compare_rays(gpu, tuning, findings))),
         ("views of many Gaussians".into(), Box::new(move |findings| blobs::compare_maxima(gpu, tuning, findings))),
         ("volumes of Gaussians".into(), Box::new(move |findings| blobs::compare_cells(gpu, tuning, findings))),

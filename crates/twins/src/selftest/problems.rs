@@ -2,7 +2,7 @@
 
 use crate::config::sections::{self, Deformable};
 use crate::config::{Config, Preset};
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, Units};
 use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry};
@@ -10,18 +10,16 @@ use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
 use crate::methods::dynamic_gaussians::lengths::Lengths;
 use crate::methods::dynamic_gaussians::shared_images::SharedImages;
 use crate::methods::dynamic_gaussians::targets::{PossibleVessel, Targets};
-use crate::methods::dynamic_gaussians::twin::DeformableParams;
 use crate::random::{STREAM_JITTER, normal};
+use crate::reference::dynamic_gaussians::DeformableParams;
 use crate::reference::gaussians::params;
-use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use crate::scan::small::rays;
 use glam::DVec3;
-use std::path::PathBuf;
 
 /// A configuration small enough for f64 twins, on top of a preset.
 ///
 /// # Errors
-/// [`Error::Config`] for a setting that is not usable.
+/// [`crate::error::Error::Config`] for a setting that is not usable.
 pub fn small_config(preset: Preset, settings: &[&str]) -> Result<Config> {
     let small = [
         "train.rays=21",
@@ -81,7 +79,7 @@ pub fn units() -> Units {
 /// Targets of Gaussians: images that no vessel explains; the last view has no image of the last phase.
 ///
 /// # Errors
-/// [`Error::Config`] for an impossible size.
+/// [`crate::error::Error::Config`] for an impossible size.
 pub fn targets(width: usize, height: usize, n_phases: usize) -> Result<Targets> {
     let view = |angles: &[f64; 2]| Ok(SplatView::new(&rays(&c_arm(*angles), width, height)?, units()));
     let views = ANGLES_DEG.iter().map(view).collect::<Result<Vec<SplatView>>>()?;

@@ -4,10 +4,10 @@
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{GaussianSetup, R2Gaussian, R2Schedule, R2Setup};
 use crate::methods::r2_gaussian::parameters::{ScaleBounds, softplus};
-use crate::methods::r2_gaussian::twin_chords::Chords;
-use crate::methods::r2_gaussian::twin_shape::{bounds, pixels_within, position, scale};
 use crate::reference::adam::Adam;
 use crate::reference::gaussians::{N_PARAMS, Params, axes, rotation_gradient};
+use crate::reference::r2_gaussian_chords::Chords;
+use crate::reference::r2_gaussian_shape::{bounds, pixels_within, position, scale};
 use glam::{DMat2, DMat3, DVec2, DVec3};
 
 /// Distance from the image's centre at which slopes stop following the Gaussian's centre, in half images.

@@ -6,7 +6,6 @@ use crate::gaussians::field::DynamicGaussians;
 use crate::gpu::device::Gpu;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::Tuning;
-use crate::methods::r2_gaussian::selftest as r2;
 use crate::model::Model;
 use crate::model::component::Component;
 use crate::model::params::ParamMap;
@@ -19,6 +18,7 @@ use crate::scan::dataset::Dataset;
 use crate::scan::small::small_dataset;
 use crate::selftest::compare::{Findings, Tolerance};
 use crate::selftest::problems::{drawn_fields, random_gaussians};
+use crate::selftest::r2_gaussian as r2;
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 
