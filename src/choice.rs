@@ -36,7 +36,6 @@ mod tests {
     use crate::formats::raw::Element;
     use crate::kernels::tuning::Layers;
     use crate::model::component::Component;
-    use crate::phantom::dataset::Setting;
     use crate::render::quantity::Projection;
     use crate::scan::dataset::Layout;
     use crate::scan::gating::BeatScaling;
@@ -62,7 +61,6 @@ mod tests {
         check_names_in_files::<BeatScaling>();
         check_names_in_files::<Layers>();
         check_names_in_files::<Layout>();
-        check_names_in_files::<Setting>();
     }
 
     #[test]

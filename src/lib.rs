@@ -220,23 +220,4 @@ pub mod score {
     pub mod volume;
 }
 
-/// Synthetic data with exact truth.
-pub mod phantom {
-    mod blades;
-    mod catheter;
-    pub mod dataset;
-    pub mod degradations;
-    mod inflow;
-    pub mod noise;
-    pub mod projector;
-    mod runs;
-    mod sight;
-    pub mod stenosis;
-    mod subjects;
-    pub mod tree;
-    pub mod tree_file;
-    pub mod views;
-    pub mod voxels;
-}
-
 pub mod bench;

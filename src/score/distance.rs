@@ -6,8 +6,9 @@ use crate::model::scene::Scene;
 use crate::render::renderer::Renderer;
 use crate::scan::dataset::Dataset;
 use crate::scan::gating::SYSTOLE_SHARE;
+use crate::scan::truth::{VOLUMES, truth_file};
 use crate::score::shapes::chamfer_mm;
-use crate::score::volume::{TrueVessels, VOLUMES, on_one_grid, pixel_mm, read, truth_file};
+use crate::score::volume::{TrueVessels, on_one_grid, pixel_mm, read};
 use crate::vessels::field::VesselField;
 use std::path::PathBuf;
 

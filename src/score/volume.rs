@@ -9,6 +9,7 @@ use crate::model::scene::Scene;
 use crate::render::grid::PatientGrid;
 use crate::render::renderer::Renderer;
 use crate::scan::dataset::Dataset;
+use crate::scan::truth::{VOLUMES, truth_file};
 use crate::score::metrics::dice;
 use crate::score::shapes::{Agreement, WITHIN_MM, compare};
 use crate::vessels::distances::DistanceMap;
@@ -19,8 +20,6 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Directory of the volumes inside a dataset.
-pub const VOLUMES: &str = "volumes";
 /// Share of the vessel attenuation above which a voxel of the truth is vessel, and one of the field is lumen.
 const LUMEN_SHARE: f64 = 0.5;
 /// Distance from a vessel beyond which attenuation is far from it, pixels.
@@ -75,11 +74,6 @@ pub struct VolumeScores {
     pub mean_as_stated: Option<Scores>,
     /// One row per phase.
     pub phases: Vec<PhaseScores>,
-}
-
-/// Path of the true vessels at a phase.
-pub fn truth_file(volumes: &Path, phase: u32) -> PathBuf {
-    volumes.join(format!("vessels-{phase:02}.nrrd"))
 }
 
 /// Scores the dynamic field where it exceeds `threshold_per_mm` at every phase whose truth is in the dataset's directory;

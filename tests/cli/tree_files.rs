@@ -2,8 +2,8 @@
 
 use crate::known_tree::{PHASES, Trained, nertca, ok, text, trained};
 use crate::python::python;
-use nertca_vk::phantom::tree_file::TreeFile;
 use nertca_vk::random::{STREAM_SHAPE, uniform01};
+use nertca_vk_phantom::tree_file::TreeFile;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;

@@ -4,14 +4,14 @@ use glam::DVec3;
 use nertca_vk::calibrate::gauge::{FrameRays, RigidMotion, common_motion};
 use nertca_vk::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays, lps_mm_from_world, world_from_lps_mm};
 use nertca_vk::gpu::device::Gpu;
-use nertca_vk::phantom::projector::{LoadedVolume, Projector};
-use nertca_vk::phantom::tree::{Bounds, Heart, Tree};
-use nertca_vk::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
-use nertca_vk::phantom::voxels::{self, Breath, Tissues};
 use nertca_vk::random::{STREAM_PHOTON, normal, uniform01};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use nertca_vk::scan::gating::contraction;
 use nertca_vk::scan::truth::{TrueFrame, Truth};
+use nertca_vk_phantom::projector::{LoadedVolume, Projector};
+use nertca_vk_phantom::tree::{Bounds, Heart, Tree};
+use nertca_vk_phantom::views::{CArmOptions, PixelPitch, ViewAngles};
+use nertca_vk_phantom::voxels::{self, Breath, Tissues};
 use std::path::Path;
 
 pub const PHASES: u32 = 10;

@@ -8,10 +8,10 @@ use nertca_vk::formats::volume::{Volume, VolumeHeader, VolumeHints};
 use nertca_vk::formats::vtp::{Lines, Values};
 use nertca_vk::formats::{images, metaimage, nifti, npy, nrrd, png, volume_files};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
-use nertca_vk::phantom::tree_file::TreeFile;
 use nertca_vk::plan::Plan;
 use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_phantom::tree_file::TreeFile;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 

@@ -6,12 +6,12 @@ use glam::DVec3;
 use nertca_vk::check::{Check, Verdict, check, compare};
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::geometry::{CArm, Geometry};
-use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
-use nertca_vk::phantom::degradations::Degradations;
-use nertca_vk::phantom::views::ViewAngles;
 use nertca_vk::plan::Plan;
 use nertca_vk::random::{STREAM_PHOTON, normal, uniform01};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
+use nertca_vk_phantom::dataset::{PhantomOptions, Setting, make};
+use nertca_vk_phantom::degradations::Degradations;
+use nertca_vk_phantom::views::ViewAngles;
 use std::f64::consts::TAU;
 
 const PHASES: u32 = 8;

@@ -1,12 +1,13 @@
 //! Procedural phantoms against the attenuations and extents of the authors' volumes.
 
 use crate::common::{expect_silence, gpu};
+use nertca_vk::choice::Choice;
 use nertca_vk::formats::volume::{Volume, VolumeHints};
 use nertca_vk::formats::volume_files;
-use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
-use nertca_vk::phantom::degradations::Degradations;
-use nertca_vk::phantom::views::ViewAngles;
 use nertca_vk::scan::dataset::{Dataset, Layout};
+use nertca_vk_phantom::dataset::{PhantomOptions, Setting, make};
+use nertca_vk_phantom::degradations::Degradations;
+use nertca_vk_phantom::views::ViewAngles;
 use std::num::NonZeroU32;
 
 const SIZE: usize = 64;
@@ -17,6 +18,13 @@ struct Made {
     dataset: Dataset,
     background: Volume,
     vessels: Volume,
+}
+
+#[test]
+fn names_of_settings_are_those_in_files() {
+    for &setting in Setting::ALL {
+        assert_eq!(serde_json::to_value(setting).unwrap(), setting.name());
+    }
 }
 
 fn made(setting: Setting) -> Made {

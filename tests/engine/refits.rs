@@ -7,14 +7,14 @@ use nertca_vk::config::{Config, GaussianForm, Preset};
 use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::gpu::device::Gpu;
-use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
-use nertca_vk::phantom::degradations::Degradations;
-use nertca_vk::phantom::views::ViewAngles;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split};
 use nertca_vk::score::eval::evaluate;
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_phantom::dataset::{PhantomOptions, Setting, make};
+use nertca_vk_phantom::degradations::Degradations;
+use nertca_vk_phantom::views::ViewAngles;
 use nertca_vk_runs::session::{FrameTime, NewFrame, Session, SessionOptions};
 
 const PHASES: u32 = 10;

@@ -10,11 +10,11 @@ use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::formats::volume::VolumeHints;
-use nertca_vk::phantom::dataset::{Anatomy, PhantomOptions, VolumeOptions, make, project_volumes};
-use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::scan::dataset::Layout;
 use nertca_vk_import::angiograms::ImportOptions;
 use nertca_vk_import::intake::import_dicom_as_stated;
+use nertca_vk_phantom::dataset::{Anatomy, PhantomOptions, VolumeOptions, make, project_volumes};
+use nertca_vk_phantom::degradations::Degradations;
 use std::path::{Path, PathBuf};
 
 /// Arguments of `import`.

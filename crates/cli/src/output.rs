@@ -6,12 +6,11 @@ use nertca_vk::checkpoint::newest;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use nertca_vk::fingerprint::Fingerprint;
-use nertca_vk::phantom::tree_file::TREE;
 use nertca_vk::scan::dataset::{Dataset, MANIFEST};
 use nertca_vk::scan::nerfca;
 use nertca_vk::scan::references::{REFERENCES, References};
-use nertca_vk::scan::truth::TRUTH;
-use nertca_vk::score::volume::VOLUMES;
+use nertca_vk::scan::truth::{TRUTH, VOLUMES};
+use nertca_vk_phantom::tree_file::TREE;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 

@@ -2,8 +2,8 @@
 //! added. Both drive the engine, the crate `nertca-vk`.
 
 use nertca_vk::{
-    calibrate, check, checkpoint, config, error, files, fitting, formats, geometry, gpu, kernels, methods, model,
-    phantom, plan, render, scan, score, train, trees,
+    calibrate, check, checkpoint, config, error, files, fitting, formats, geometry, gpu, kernels, methods, model, plan,
+    render, scan, score, train, trees,
 };
 
 /// One run, from a dataset to a run directory.

@@ -2,8 +2,8 @@
 //! this crate; no result depends on it.
 
 use nertca_vk::{
-    choice, config, error, fields, fitting, formats, gaussians, geometry, gpu, kernels, methods, model, network,
-    phantom, plan, random, render, scan, train,
+    choice, config, error, fields, fitting, formats, gaussians, geometry, gpu, kernels, methods, model, network, plan,
+    random, render, scan, train,
 };
 
 /// Reference implementations of the compute stages in f64: plain loops, no device. They serve tests and `selftest`; no result

@@ -9,6 +9,8 @@ use std::path::{Path, PathBuf};
 
 /// Name of the file inside a dataset.
 pub const TRUTH: &str = "truth.json";
+/// Directory of the volumes inside a dataset.
+pub const VOLUMES: &str = "volumes";
 const FORMAT: &str = "nertca-truth";
 const VERSION: u32 = 1;
 const MAX_BYTES: u64 = 256 << 20;
@@ -117,6 +119,11 @@ impl Truth {
     pub fn write(&self, dataset: &Path) -> Result<()> {
         Ok(files::write_atomic(&dataset.join(TRUTH), files::pretty_json(self)?.as_bytes())?)
     }
+}
+
+/// Path of the true vessels at a phase.
+pub fn truth_file(volumes: &Path, phase: u32) -> PathBuf {
+    volumes.join(format!("vessels-{phase:02}.nrrd"))
 }
 
 #[cfg(test)]

@@ -3,10 +3,10 @@
 use crate::error::{Error, Result};
 use crate::formats::volume::{Volume, VolumeHints};
 use crate::formats::volume_files;
-use crate::phantom::tree::Tree;
-use crate::phantom::tree_file::TreeFile;
 use crate::scan::prior::{MAX_PRIOR_POINTS, VesselPrior};
 use glam::DVec3;
+use nertca_vk_phantom::tree::Tree;
+use nertca_vk_phantom::tree_file::TreeFile;
 use std::collections::BTreeMap;
 use std::path::Path;
 

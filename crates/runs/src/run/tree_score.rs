@@ -2,16 +2,15 @@
 
 use crate::calibrate::gauge::RigidMotion;
 use crate::error::Result;
-use crate::phantom::tree::{Branch, Tree};
-use crate::phantom::tree_file::{TREE, TreeFile};
 use crate::scan::dataset::Dataset;
-use crate::scan::truth::{TRUTH, TrueLesion, Truth};
+use crate::scan::truth::{TRUTH, TrueLesion, Truth, VOLUMES};
 use crate::score::calibrated::{carried_by, in_calibrated_frame};
 use crate::score::lesions::{self, LesionScores, TruePlace};
 use crate::score::trees::{self, TreeScores, TrueLine};
-use crate::score::volume::VOLUMES;
 use crate::trees::tree::{BeatTree, PhaseTree};
 use glam::DVec3;
+use nertca_vk_phantom::tree::{Branch, Tree};
+use nertca_vk_phantom::tree_file::{TREE, TreeFile};
 
 /// Scores a tree of all phases against the true tree of a phantom; `None` where there is none. The dataset has the geometry
 /// that the reconstruction used. Scores are computed in the frame of the reconstruction; the means without this motion are

@@ -2,8 +2,8 @@
 
 use crate::formats::volume::Volume;
 use crate::geometry::{MM_PER_UNIT, ViewRays, world_to_index};
-use crate::phantom::projector::{bounding_radius, depth_steps};
 use glam::DVec3;
+use nertca_vk_phantom::projector::{bounding_radius, depth_steps};
 
 /// Trilinear value at a voxel index; zero outside.
 pub fn trilinear(volume: &Volume, index: DVec3) -> f64 {

@@ -5,11 +5,11 @@ use crate::formats::volume::Volume;
 use crate::geometry::{CArm, Geometry, ViewRays};
 use crate::gpu::device::Gpu;
 use crate::kernels::push::{self, PushConstants};
-use crate::phantom::projector::Projector;
 use crate::reference::projector::project_pixel;
 use crate::scan::small;
 use crate::selftest::compare::{Findings, Tolerance};
 use glam::{DAffine3, DMat3, DVec3};
+use nertca_vk_phantom::projector::Projector;
 
 const PROJECT: &[&str] = &[push::Project::SHADER];
 /// Positions in f32.

@@ -3,10 +3,10 @@
 use crate::error::{Error, Result};
 use crate::formats::volume::Volume;
 use crate::geometry::{CArm, Geometry, MM_PER_UNIT, world_from_lps_mm};
-use crate::phantom::projector::{bounding_radius, depth_steps};
-use crate::phantom::tree::{Bounds, Branch};
-use crate::phantom::tree_file::{TreeFile, UNITS};
-use crate::phantom::voxels::grid_size;
+use crate::projector::{bounding_radius, depth_steps};
+use crate::tree::{Bounds, Branch};
+use crate::tree_file::{TreeFile, UNITS};
+use crate::voxels::grid_size;
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use std::path::Path;

@@ -1,6 +1,6 @@
 //! Inflow of contrast from the ostium to the ends of the vessels.
 
-use crate::phantom::tree::{Branch, Tree};
+use crate::tree::{Branch, Tree};
 
 /// Largest distance between a branch's first point and another branch's centreline at which the branch may leave the other:
 /// this multiple of the other's radius plus this length in mm. Branches are assumed to be listed from their beginnings on.

@@ -1,6 +1,6 @@
 //! Collimator blade in an image.
 
-use crate::phantom::degradations::{Chance, Draw};
+use crate::degradations::{Chance, Draw};
 
 /// Side of the image that a blade enters from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

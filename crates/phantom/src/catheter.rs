@@ -1,8 +1,8 @@
 //! A coronary catheter: it enters through the aorta, with its tip in the ostium.
 
 use crate::formats::volume::Volume;
-use crate::phantom::tree::{Branch, Tree, spline};
-use crate::phantom::voxels;
+use crate::tree::{Branch, Tree, spline};
+use crate::voxels;
 use glam::DVec3;
 
 /// Radius, mm: 6 French, which is a diameter of 2 mm.

@@ -1,9 +1,9 @@
 //! Times of the images of each view, with the state of heart, breath and contrast at each time.
 
-use crate::phantom::degradations::{Breathing, Chance, Degradations, Draw, Rhythm};
-use crate::phantom::voxels::Breath;
+use crate::degradations::{Breathing, Chance, Degradations, Draw, Rhythm};
 use crate::scan::dataset::Split;
 use crate::scan::gating::{BeatTime, two_segment_fraction};
+use crate::voxels::Breath;
 use glam::DVec3;
 
 /// Length of a beat without a stated heart rate, seconds; phases divide it equally.

@@ -1,8 +1,8 @@
 //! Stenoses: places where a vessel of a phantom is narrowed.
 
 use crate::error::{Error, Result};
-use crate::phantom::tree::Tree;
 use crate::scan::truth::TrueLesion;
+use crate::tree::Tree;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
 
@@ -132,7 +132,7 @@ fn check(stenosis: &Stenosis, along_mm: &[f64]) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::phantom::tree::Branch;
+    use crate::tree::Branch;
     use glam::DVec3;
 
     /// A trunk of 40 mm along x and a branch of 20 mm that leaves its middle, both of 2 mm radius, with a point every mm.

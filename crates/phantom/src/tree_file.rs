@@ -3,7 +3,7 @@
 use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::vtp::{self, ReadLines};
-use crate::phantom::tree::{Bounds, Branch, Tree};
+use crate::tree::{Bounds, Branch, Tree};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};

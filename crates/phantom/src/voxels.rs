@@ -1,7 +1,7 @@
 //! Attenuation volumes: the procedural thorax, a real CT, and vessels drawn into voxels.
 
 use crate::formats::volume::Volume;
-use crate::phantom::tree::{Bounds, Heart, Tree};
+use crate::tree::{Bounds, Heart, Tree};
 use glam::DVec3;
 use rayon::prelude::*;
 

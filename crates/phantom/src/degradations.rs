@@ -5,7 +5,7 @@
 
 use crate::error::{Error, Result};
 use crate::geometry::CArm;
-use crate::phantom::noise::Photons;
+use crate::noise::Photons;
 use crate::random::{STREAM_ACQUISITION, normal, uniform01};
 use crate::scan::dataset::Layout;
 use crate::scan::gating::BeatScaling;

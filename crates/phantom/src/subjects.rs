@@ -1,19 +1,18 @@
 //! Subjects of the images: a procedural thorax, a tree in a CT, or a user's volumes.
 
+use crate::catheter;
 use crate::error::{Error, Result};
 use crate::formats::nrrd;
 use crate::formats::volume::{Volume, VolumeHints};
 use crate::formats::volume_files;
-use crate::phantom::catheter;
-use crate::phantom::projector::{LoadedVolume, Projector};
-use crate::phantom::sight::{Seen, Sight, check_lengths, check_spacing};
-use crate::phantom::stenosis::{Narrowing, Stenosis};
-use crate::phantom::tree::{Bounds, Heart, Tree};
-use crate::phantom::tree_file::TreeFile;
-use crate::phantom::voxels::{self, Breath, Tissues};
+use crate::projector::{LoadedVolume, Projector};
 use crate::scan::gating::contraction;
-use crate::scan::truth::TrueLesion;
-use crate::score::volume::truth_file;
+use crate::scan::truth::{TrueLesion, truth_file};
+use crate::sight::{Seen, Sight, check_lengths, check_spacing};
+use crate::stenosis::{Narrowing, Stenosis};
+use crate::tree::{Bounds, Heart, Tree};
+use crate::tree_file::TreeFile;
+use crate::voxels::{self, Breath, Tissues};
 use glam::DVec3;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -30,7 +29,7 @@ pub(super) struct Pose {
     pub(super) fraction: f64,
     pub(super) breath: Breath,
     pub(super) catheter: bool,
-    /// Share of the vessels that is filled, see [`crate::phantom::runs::Shot`].
+    /// Share of the vessels that is filled, see [`crate::runs::Shot`].
     pub(super) filled_to: f64,
 }
 
