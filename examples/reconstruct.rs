@@ -15,10 +15,10 @@ use nertca_vk::model::component::Component;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
-use nertca_vk::score::eval::evaluate;
-use nertca_vk::score::pictures::{Window, write_grey};
 use nertca_vk::train::trainer::Trainer;
 use nertca_vk::train::training::Training;
+use nertca_vk_vessels::score::eval::evaluate;
+use nertca_vk_vessels::score::pictures::{Window, write_grey};
 use std::path::PathBuf;
 
 fn main() -> Result<()> {

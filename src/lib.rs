@@ -79,8 +79,9 @@ pub use nertca_vk_gpu as gpu;
 pub use nertca_vk_formats as formats;
 pub use nertca_vk_formats::{files, raster};
 
+use nertca_vk_angiograms::linear;
 /// Angiograms, and what is known of them without a device: a crate of its own.
-pub use nertca_vk_angiograms::{calibrate, check, error, evidence, fingerprint, geometry, linear, scan};
+pub use nertca_vk_angiograms::{calibrate, check, error, evidence, fingerprint, geometry, scan};
 
 pub mod config;
 
@@ -162,62 +163,6 @@ pub mod export {
     pub mod structured;
     pub mod surfaces;
     pub mod volumes;
-}
-
-/// Vessels of the dynamic field, as sets of voxels.
-pub mod vessels {
-    pub mod centreline;
-    pub mod distances;
-    pub(crate) mod field;
-    pub mod mask;
-    pub mod threshold;
-}
-
-/// Vessels as trees of centrelines with radii, followed over the beat.
-pub mod trees {
-    pub mod areas;
-    mod blur;
-    mod branches;
-    pub mod doubt;
-    pub mod extract;
-    pub mod files;
-    mod follow;
-    mod graph;
-    mod information;
-    pub mod lesions;
-    #[cfg(feature = "dicom")]
-    pub mod measurements;
-    pub mod next_view;
-    #[cfg(feature = "dicom")]
-    pub mod over_frames;
-    mod radii;
-    mod refine;
-    mod ridges;
-    mod sampled;
-    mod shadowed;
-    mod shadows;
-    pub mod sight;
-    mod slides;
-    mod solid;
-    mod tidy;
-    pub mod tree;
-    mod tubes;
-}
-
-/// Quality measures of a reconstruction.
-pub mod score {
-    pub mod calibrated;
-    pub mod ceiling;
-    pub mod dice;
-    pub mod distance;
-    pub mod eval;
-    pub mod lesions;
-    pub mod metrics;
-    mod nearest;
-    pub mod pictures;
-    pub mod shapes;
-    pub mod trees;
-    pub mod volume;
 }
 
 pub mod bench;

@@ -16,7 +16,7 @@ use std::path::Path;
 const WHITE: f64 = 65535.0;
 const EXPLICIT_LITTLE_ENDIAN: &str = "1.2.840.10008.1.2.1";
 /// Label that viewers show beside the picture, wherever they show text of the file.
-pub(crate) const LABEL: &str = "RESEARCH USE ONLY - NOT FOR DIAGNOSIS";
+pub const LABEL: &str = "RESEARCH USE ONLY - NOT FOR DIAGNOSIS";
 /// Largest number of characters of a decimal string.
 const DECIMAL_CHARACTERS: usize = 16;
 /// Largest size of pixel data of explicit length, bytes.
@@ -117,7 +117,7 @@ pub(super) struct Identity<'a> {
 
 /// A code of a coding scheme (PS3.3 8.8).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Code {
+pub struct Code {
     /// Value of the code, at most 16 characters.
     pub value: &'static str,
     /// Designator of its scheme.
@@ -138,9 +138,9 @@ impl Code {
 }
 
 /// Category of what is segmented and measured.
-pub(crate) const ANATOMY: Code = Code { value: "123037004", scheme: "SCT", meaning: "Anatomical Structure" };
+pub const ANATOMY: Code = Code { value: "123037004", scheme: "SCT", meaning: "Anatomical Structure" };
 /// Vessels that are segmented and measured.
-pub(crate) const CORONARY: Code = Code { value: "41801008", scheme: "SCT", meaning: "Coronary artery" };
+pub const CORONARY: Code = Code { value: "41801008", scheme: "SCT", meaning: "Coronary artery" };
 
 /// Adds a sequence.
 pub(super) fn add_sequence(object: &mut InMemDicomObject, tag: Tag, items: Vec<InMemDicomObject>) {

@@ -14,7 +14,7 @@ use std::time::SystemTime;
 
 /// Relationship of a content item to the item that contains it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Relationship {
+pub enum Relationship {
     /// The item is a part of the other.
     Contains,
     /// The item says who observed, and what.
@@ -38,7 +38,7 @@ impl Relationship {
 
 /// Value of a content item.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Value {
+pub enum Value {
     /// Items of a template of PS3.16 (`1500` for TID 1500), or of none.
     Container(Option<&'static str>),
     /// Text for people.
@@ -55,7 +55,7 @@ pub(crate) enum Value {
 
 /// Content item of a report.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct ContentItem {
+pub struct ContentItem {
     /// Relationship to the item that contains this one; the root ignores it.
     pub relationship: Relationship,
     /// Name of the value.
@@ -140,7 +140,7 @@ impl Value {
 
 /// Coding scheme of codes that no standard has.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct PrivateScheme {
+pub struct PrivateScheme {
     /// Designator, which begins with 99.
     pub designator: &'static str,
     /// Name.
@@ -168,7 +168,7 @@ pub struct ReportSeeds {
 ///
 /// # Errors
 /// [`crate::error::Error::Io`].
-pub(crate) fn write(path: &Path, root: &ContentItem, scheme: &PrivateScheme, seeds: &ReportSeeds) -> Result<()> {
+pub fn write(path: &Path, root: &ContentItem, scheme: &PrivateScheme, seeds: &ReportSeeds) -> Result<()> {
     let [study, series, frame, instance] = [seeds.study, seeds.series, seeds.frame, seeds.instance].map(uid);
     let mut object = InMemDicomObject::new_empty();
     let uids = [study.as_str(), &series, &instance];

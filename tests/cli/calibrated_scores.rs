@@ -8,7 +8,7 @@ use nertca_vk::config::Config;
 use nertca_vk::geometry::{Geometry, MM_PER_UNIT};
 use nertca_vk::scan::dataset::{Dataset, Frame, Split};
 use nertca_vk::scan::truth::Truth;
-use nertca_vk::score::calibrated::{carried_by, in_calibrated_frame};
+use nertca_vk_vessels::score::calibrated::{carried_by, in_calibrated_frame};
 use serde_json::Value;
 use std::path::Path;
 

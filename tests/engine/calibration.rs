@@ -14,10 +14,10 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::scan::writer;
-use nertca_vk::score::calibrated::in_calibrated_frame;
-use nertca_vk::score::eval::evaluate;
 use nertca_vk::train::trainer::Trainer;
 use nertca_vk_runs::session::{FrameTime, NewFrame, Session, SessionOptions};
+use nertca_vk_vessels::score::calibrated::in_calibrated_frame;
+use nertca_vk_vessels::score::eval::evaluate;
 use std::time::Instant;
 
 fn config(mode: &str) -> Config {

@@ -9,8 +9,8 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout, Split};
 use nertca_vk::scan::writer::convert;
-use nertca_vk::score::eval::{Evaluation, evaluate};
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk_vessels::score::eval::{Evaluation, evaluate};
 use serde_json::{Value, json};
 use std::path::Path;
 

@@ -10,12 +10,12 @@ use nertca_vk::gpu::device::Gpu;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split};
-use nertca_vk::score::eval::evaluate;
 use nertca_vk::train::trainer::Trainer;
 use nertca_vk_phantom::dataset::{PhantomOptions, Setting, make};
 use nertca_vk_phantom::degradations::Degradations;
 use nertca_vk_phantom::views::ViewAngles;
 use nertca_vk_runs::session::{FrameTime, NewFrame, Session, SessionOptions};
+use nertca_vk_vessels::score::eval::evaluate;
 
 const PHASES: u32 = 10;
 /// Iterations of Gaussians; a continued fit skips the first third.

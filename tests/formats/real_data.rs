@@ -10,9 +10,9 @@ use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::scan::gating::BeatScaling;
 use nertca_vk::train::trainer::Trainer;
-use nertca_vk::vessels::threshold::vessel_threshold;
 use nertca_vk_import::angiograms::{Gating, ImportOptions};
 use nertca_vk_import::intake::import_dicom;
+use nertca_vk_vessels::vessels::threshold::vessel_threshold;
 use std::path::PathBuf;
 
 fn runs() -> Option<Vec<PathBuf>> {

@@ -20,8 +20,6 @@ use nertca_vk::methods::dynamic_gaussians::shared_images::SharedImages;
 use nertca_vk::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use nertca_vk::methods::dynamic_gaussians::targets::Targets;
 use nertca_vk::scan::dataset::{Dataset, Frame};
-use nertca_vk::score::metrics;
-use nertca_vk::vessels::threshold::VESSEL_SHARE;
 use nertca_vk_twins::reference::dynamic_gaussians::{DeformableParams, loss_and_gradient};
 use nertca_vk_twins::reference::gaussians::{self as reference, N_PARAMS, Params, params};
 use nertca_vk_twins::reference::maxima::maxima;
@@ -30,6 +28,8 @@ use nertca_vk_twins::selftest::gaussians::{self, TENSORS, device_gradient, numbe
 use nertca_vk_twins::selftest::problems::{
     self, ANGLES_DEG, deformable_case, deformable_set, fillings, random_gaussians, units, with_gaussians,
 };
+use nertca_vk_vessels::score::metrics;
+use nertca_vk_vessels::vessels::threshold::VESSEL_SHARE;
 use std::time::Instant;
 
 /// The default configuration.

@@ -3,8 +3,8 @@
 use crate::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
 use crate::status::{Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_NOT_READY, Outcome, nertca_status};
 use crate::types::{nertca_lesion, nertca_tree, read, write};
-use nertca_vk::trees::lesions::{Lesion, lesions};
-use nertca_vk::trees::tree::{BeatTree, Branch, RadiiFrom};
+use nertca_vk_vessels::trees::lesions::{Lesion, lesions};
+use nertca_vk_vessels::trees::tree::{BeatTree, Branch, RadiiFrom};
 use std::sync::PoisonError;
 
 /// Finds the vessels at all phases as trees of centrelines with radii. If all arrays of `tree` are null, the call searches and
@@ -220,7 +220,7 @@ impl FlatTree {
 mod tests {
     use super::*;
     use glam::DVec3;
-    use nertca_vk::trees::tree::PhaseTree;
+    use nertca_vk_vessels::trees::tree::PhaseTree;
 
     #[test]
     fn branches_of_all_phases_follow_each_other_with_their_gaps() {

@@ -5,9 +5,9 @@ use crate::reconstruction::{nertca_reconstruction, on_reconstruction};
 use crate::status::{Failure, Outcome, nertca_status};
 use crate::types::{nertca_grid, nertca_scores, nertca_tree, read, write};
 use glam::DVec3;
-use nertca_vk::score::eval::Evaluation;
-use nertca_vk::score::trees::TrueLine;
-use nertca_vk::score::volume::TrueVessels;
+use nertca_vk_vessels::score::eval::Evaluation;
+use nertca_vk_vessels::score::trees::TrueLine;
+use nertca_vk_vessels::score::volume::TrueVessels;
 use std::collections::BTreeMap;
 
 /// Maximum number of points and of branches of a true tree.

@@ -11,11 +11,11 @@ use nertca_vk::checkpoint::newest_model;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::pretty_json;
 use nertca_vk::scan::dataset::Dataset;
-use nertca_vk::score::ceiling::truth_dice;
-use nertca_vk::score::dice::BestDice;
-use nertca_vk::score::eval::{BestDices, Evaluation};
 use nertca_vk_runs::run::info::RunInfo;
 use nertca_vk_runs::run::score::{ScoreOptions, as_trained, evaluate_model};
+use nertca_vk_vessels::score::ceiling::truth_dice;
+use nertca_vk_vessels::score::dice::BestDice;
+use nertca_vk_vessels::score::eval::{BestDices, Evaluation};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 

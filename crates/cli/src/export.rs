@@ -20,7 +20,7 @@ use nertca_vk::render::grid::PatientGrid;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::scan::writer::convert as convert_dataset;
-use nertca_vk::vessels::threshold::vessel_threshold_per_mm;
+use nertca_vk_vessels::vessels::threshold::vessel_threshold_per_mm;
 use std::path::{Path, PathBuf};
 
 /// Arguments of `export`.

@@ -9,7 +9,7 @@ use nertca_vk::files::{path_in_json, pretty_json};
 use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::scan::dataset::{Dataset, Split, manifest_schema};
-use nertca_vk::score::pictures::Window;
+use nertca_vk_vessels::score::pictures::Window;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 

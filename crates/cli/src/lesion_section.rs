@@ -1,9 +1,9 @@
 //! Stenoses in the report: a table with their sight in each training view, and the vessels straightened with their diameters.
 
 use maud::{Markup, html};
-use nertca_vk::trees::lesions::{Lesion, MIN_PERCENT, StraightVessel, straight_vessels};
-use nertca_vk::trees::sight::TreeInView;
-use nertca_vk::trees::tree::{BeatTree, PhaseTree, TreeView};
+use nertca_vk_vessels::trees::lesions::{Lesion, MIN_PERCENT, StraightVessel, straight_vessels};
+use nertca_vk_vessels::trees::sight::TreeInView;
+use nertca_vk_vessels::trees::tree::{BeatTree, PhaseTree, TreeView};
 use std::fmt::Write as _;
 
 /// Number of vessels that are drawn straightened, besides those with a stenosis.

@@ -10,8 +10,8 @@ use nertca_vk::error::Result;
 use nertca_vk::files::pretty_json;
 use nertca_vk::formats::png;
 use nertca_vk::geometry::CArm;
-use nertca_vk::trees::next_view::{ArmLimits, Candidate, Subject, best, candidates, decisive_phases};
-use nertca_vk::trees::tree::{BeatTree, PhaseTree, TreeView};
+use nertca_vk_vessels::trees::next_view::{ArmLimits, Candidate, Subject, best, candidates, decisive_phases};
+use nertca_vk_vessels::trees::tree::{BeatTree, PhaseTree, TreeView};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 

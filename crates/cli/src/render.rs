@@ -18,7 +18,7 @@ use nertca_vk::render::baked::{BAKED_CELLS, Baked};
 use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::gating::{SYSTOLE_S, SYSTOLE_SHARE};
-use nertca_vk::score::pictures::{self, Window};
+use nertca_vk_vessels::score::pictures::{self, Window};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

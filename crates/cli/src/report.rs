@@ -12,10 +12,10 @@ use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::model::Model;
 use nertca_vk::scan::canvas::in_words;
 use nertca_vk::scan::dataset::Dataset;
-use nertca_vk::score::eval::Evaluation;
-use nertca_vk::trees::tree::BeatTree;
 use nertca_vk_runs::run::history::History;
 use nertca_vk_runs::run::{hull_pictures, silhouette_pictures};
+use nertca_vk_vessels::score::eval::Evaluation;
+use nertca_vk_vessels::trees::tree::BeatTree;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 

@@ -17,12 +17,12 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::scan::prior::{PRIOR, VesselPrior};
-use nertca_vk::score::eval::{Evaluation, moving_field_warning};
 use nertca_vk_runs::run::events::Event;
 use nertca_vk_runs::run::info::RunInfo;
 use nertca_vk_runs::run::prior;
 use nertca_vk_runs::run::reconstruct::{CONFIG, RunOptions, reconstruct};
 use nertca_vk_runs::run::score::{ScoreOptions, as_trained, evaluate_model};
+use nertca_vk_vessels::score::eval::{Evaluation, moving_field_warning};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

@@ -10,9 +10,11 @@ use nertca_vk::error::{Error, Result};
 use nertca_vk::formats::png;
 use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk::scan::gating::SYSTOLE_SHARE;
-use nertca_vk::score::pictures::Window;
-use nertca_vk::trees::files::{note, to_json};
-use nertca_vk::trees::tree::{BeatTree, CONFIDENCE, DOUBTFUL, EXISTS_WITHIN_MM, PhaseTree, RadiiFrom, TreeView};
+use nertca_vk_vessels::score::pictures::Window;
+use nertca_vk_vessels::trees::files::{note, to_json};
+use nertca_vk_vessels::trees::tree::{
+    BeatTree, CONFIDENCE, DOUBTFUL, EXISTS_WITHIN_MM, PhaseTree, RadiiFrom, TreeView,
+};
 use serde_json::{Value, json};
 
 const SCRIPT: &str = include_str!("report_trees.js");

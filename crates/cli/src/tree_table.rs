@@ -1,8 +1,8 @@
 //! Scores of a tree as a table.
 
 use super::score_table::{Column, ScoreTable, mm, percent};
-use nertca_vk::score::lesions::{FOUND_WITHIN_MM, LesionScores, RIGHT_WITHIN_POINTS, SEVERE_PERCENT};
-use nertca_vk::score::trees::{TreeAgreement, TreeScores};
+use nertca_vk_vessels::score::lesions::{FOUND_WITHIN_MM, LesionScores, RIGHT_WITHIN_POINTS, SEVERE_PERCENT};
+use nertca_vk_vessels::score::trees::{TreeAgreement, TreeScores};
 
 const COLUMNS: [Column<TreeAgreement>; 10] = [
     Column { heading: ["centreline", "found"], text: |s| percent(Some(s.true_centreline_found)) },

@@ -15,7 +15,7 @@ use nertca_vk::model::component::Component;
 use nertca_vk::render::baked::Baked;
 use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::trees::tree::BeatTree;
+use nertca_vk_vessels::trees::tree::BeatTree;
 use serde_json::{Value, json};
 use std::collections::HashMap;
 use std::path::PathBuf;

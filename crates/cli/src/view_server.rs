@@ -19,7 +19,7 @@ use nertca_vk::formats::png;
 use nertca_vk::geometry::{CArm, Geometry, ViewRays};
 use nertca_vk::model::Model;
 use nertca_vk::render::quantity::Quantity;
-use nertca_vk::trees::tree::BeatTree;
+use nertca_vk_vessels::trees::tree::BeatTree;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::net::{Ipv4Addr, SocketAddr};

@@ -1,7 +1,7 @@
 //! Scores in 3D as a table.
 
 use super::score_table::{Column, ScoreTable, mm, percent};
-use nertca_vk::score::volume::{Scores, VolumeScores};
+use nertca_vk_vessels::score::volume::{Scores, VolumeScores};
 
 const COLUMNS: [Column<Scores>; 11] = [
     Column { heading: ["3D", "Dice"], text: |s| format!("{:.3}", s.agreement.dice) },

@@ -3,8 +3,9 @@
 
 use nertca_vk::{
     calibrate, check, checkpoint, config, error, files, fitting, formats, geometry, gpu, kernels, methods, model, plan,
-    render, scan, score, train, trees,
+    render, scan, train,
 };
+use nertca_vk_vessels::{score, trees};
 
 /// One run, from a dataset to a run directory.
 pub mod run {

@@ -4,8 +4,8 @@ use crate::plan::{Run, RunFingerprint, Study};
 use crate::scores::Score;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
-use nertca_vk::score::eval::Evaluation;
 use nertca_vk_runs::run::history::Validated;
+use nertca_vk_vessels::score::eval::Evaluation;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 

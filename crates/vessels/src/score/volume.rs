@@ -29,7 +29,7 @@ const FAR_MM: f64 = 2.0;
 /// Side of the minimum cube that counts as a component, pixels.
 const COMPONENT_PIXELS: f64 = 1.0;
 /// Maximum number of voxels that are compared.
-pub(crate) const MAX_VOXELS: u64 = 1 << 26;
+pub const MAX_VOXELS: u64 = 1 << 26;
 
 /// Scores of one phase, or their means.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
