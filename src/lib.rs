@@ -2,8 +2,7 @@
 //!
 //! Data flow, with the modules in their order:
 //!
-//! 1. [`scan`]: validated angiograms with geometry and phase -> line integrals (`import`, of the feature `dicom`, reads
-//!    clinical runs)
+//! 1. [`scan`]: validated angiograms with geometry and phase -> line integrals (the crate `nertca-vk-import` reads clinical runs)
 //! 2. [`evidence`]: static background, noise and possible vessels of each single view. From it, [`calibrate`] corrects the
 //!    geometry of views that disagree, and [`mod@check`] names the mistake where they cannot be made to agree;
 //!    [`plan`]: everything a run needs, which the method of the configuration prepares (a room of [`methods`] each)
@@ -12,14 +11,15 @@
 //! 4. [`train::trainer`]: a run of any method, many iterations per submit -> losses
 //! 5. [`model`]: parameters, scales, hull and configuration; [`checkpoint`] keeps them and the state of the fit in one safetensors file
 //! 6. [`render`]: any pose and phase -> projections and samples of the fields
-//! 7. [`export`] writes them for other tools, [`score`] compares them with the images, [`trees`] extracts centrelines from them
+//! 7. [`export`] writes them for other tools
 //!
-//! [`run`] connects these to a run directory, and [`session`] is a reconstruction in memory to which frames can be added, of which
-//! the crate `nertca-vk-abi` is the C interface. [`phantom`] makes synthetic data, [`mod@bench`] measures the speed, and [`mod@reference`] holds an f64 reference of every compute stage, with which tests and `selftest`
-//! compare the device; `inventory` lists pipelines as drivers compile them (both belong to the feature `diagnostics`). All of
-//! them build on the compute stages in [`kernels`] and on two crates that know nothing of angiography: [`gpu`], Vulkan compute, and
-//! [`formats`], files that other tools read and write. A module
-//! uses only modules that stand above it in this file.
+//! [`mod@bench`] measures the speed. All of them build on the compute stages in [`kernels`] and on crates that are modules here: [`gpu`],
+//! Vulkan compute, and [`formats`], files that other tools read and write, know nothing of angiography; the modules of
+//! `nertca-vk-angiograms` need no device. A module uses only modules that stand above it in this file.
+//!
+//! Above this crate are `nertca-vk-runs` (run directories, and reconstructions in memory to which frames can be added),
+//! `nertca-vk-vessels` (centrelines, stenoses and scores), `nertca-vk-phantom` (synthetic data), and `nertca-vk-twins` (an f64 reference of every
+//! compute stage, with which tests and the self-test compare the device).
 //!
 //! The following example turns a dataset into a reconstruction in memory:
 //!

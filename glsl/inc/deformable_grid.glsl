@@ -1,5 +1,5 @@
 // Deformable set of Gaussians, a single set for all phases of the beat: each Gaussian moves by the displacement of a grid, with
-// free values at each phase, and by harmonics of its own. Reference implementation: src/reference/deformable.rs.
+// free values at each phase, and by harmonics of its own. Reference implementation: crates/twins/src/reference/dynamic_gaussians.rs.
 
 // Position on the grid, in node distances from its first node.
 vec3 on_grid(vec3 position, DeformableSetup deformable) {

@@ -1,4 +1,4 @@
-// Projection of Gaussians in a cone beam. Reference implementation: src/reference/gaussians.rs.
+// Projection of Gaussians in a cone beam. Reference implementation: crates/twins/src/reference/gaussians.rs.
 #include "inc/gaussian_layout.glsl"
 
 // Splat of a Gaussian, and the intermediate results from which its gradient is computed.

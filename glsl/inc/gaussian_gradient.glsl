@@ -1,4 +1,4 @@
-// Gradient of a Gaussian's parameters from the moments of an image. Reference implementation: src/reference/gaussians.rs.
+// Gradient of a Gaussian's parameters from the moments of an image. Reference implementation: crates/twins/src/reference/gaussians.rs.
 
 struct GaussianGradient {
     vec3 position;

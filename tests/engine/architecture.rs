@@ -1,5 +1,5 @@
-//! The structure of the library: rooms (modules of `src/lib.rs`) use only rooms that stand above them there, a method is named by few
-//! files outside its own room, and doc comments are sentences.
+//! The structure of the code: crates use only crates below them, rooms (modules of a crate's `lib.rs`) use only rooms that stand above
+//! them there, a method is named by few files outside its own room, and doc comments are sentences.
 
 use crate::root::root;
 use std::collections::{BTreeMap, BTreeSet};
@@ -20,9 +20,40 @@ pub(crate) fn files(folder: &str) -> Vec<(String, String)> {
     found.iter().map(|path| (name(path), std::fs::read_to_string(path).unwrap())).collect()
 }
 
-/// Rooms in the order of `src/lib.rs`.
-fn rooms() -> Vec<String> {
-    let text = std::fs::read_to_string(root().join("src/lib.rs")).unwrap();
+/// Crates from the lowest to the highest: each uses only crates that stand before it. The one without a folder is the engine.
+const CRATES: [&str; 13] = [
+    "crates/gpu",
+    "crates/formats",
+    "crates/angiograms",
+    "crates/import",
+    "",
+    "crates/vessels",
+    "crates/phantom",
+    "crates/twins",
+    "crates/runs",
+    "crates/study",
+    "crates/capi",
+    "crates/capi/library",
+    "crates/cli",
+];
+/// Crates with rooms, which stand in the order of their `lib.rs`; the modules of the other crates are files in the order of the alphabet.
+const WITH_ROOMS: [&str; 5] = ["", "crates/angiograms", "crates/vessels", "crates/twins", "crates/runs"];
+
+/// Returns the file of a crate.
+fn of_crate(folder: &str, file: &str) -> String {
+    std::fs::read_to_string(root().join(folder).join(file)).unwrap()
+}
+
+/// Rust files of a crate, with their paths from its folder.
+fn sources(folder: &str) -> Vec<(String, String)> {
+    let from = if folder.is_empty() { String::new() } else { format!("{folder}/") };
+    let of = files(&format!("{from}src")).into_iter();
+    of.map(|(path, text)| (path.strip_prefix(&from).unwrap().to_owned(), text)).collect()
+}
+
+/// Rooms in the order of the `lib.rs` of a crate.
+fn rooms(folder: &str) -> Vec<String> {
+    let text = of_crate(folder, "src/lib.rs");
     let name = |line: &str| {
         let rest = line.strip_prefix("pub mod ").or(line.strip_prefix("pub(crate) mod "))?;
         Some(rest.trim_end_matches([';', ' ', '{']).to_owned())
@@ -37,16 +68,8 @@ fn rooms_of_line(line: &str) -> impl Iterator<Item = &str> {
         .map(|rest| rest.split(|c: char| !c.is_alphanumeric() && c != '_').next().unwrap_or(""))
 }
 
-/// Returns the room of a file of `src`. The f64 twin and the self-test of a method stand in its folder; they belong to the rooms
-/// `reference` and `selftest`, which nothing that computes a result uses.
+/// Returns the room of a file of `src`.
 fn room_of(path: &str) -> &str {
-    let file = path.rsplit('/').next().unwrap();
-    if path.starts_with("src/methods/") && file.starts_with("twin") {
-        return "reference";
-    }
-    if path.starts_with("src/methods/") && file == "selftest.rs" {
-        return "selftest";
-    }
     path.trim_start_matches("src/").split('/').next().unwrap().trim_end_matches(".rs")
 }
 
@@ -72,12 +95,59 @@ fn arrows_up(sources: &[(String, String)], rooms: &[String]) -> BTreeSet<(String
 
 #[test]
 fn rooms_use_only_rooms_above_them() {
-    let (rooms, sources) = (rooms(), files("src"));
-    assert!(rooms.len() > 30 && sources.len() > 200, "{} rooms, {} files", rooms.len(), sources.len());
-    assert_eq!(arrows_up(&sources, &rooms), BTreeSet::new());
+    let mut count = 0;
+    for folder in WITH_ROOMS {
+        let rooms = rooms(folder);
+        assert_eq!(arrows_up(&sources(folder), &rooms), BTreeSet::new(), "{folder}");
+        count += rooms.len();
+    }
+    assert!(count > 30, "{count} rooms");
     // A new arrow is seen.
-    let planted = [("src/scan/dataset.rs".to_owned(), "use crate::render::renderer::Renderer;\n".to_owned())];
-    assert_eq!(arrows_up(&planted, &rooms).len(), 1);
+    let planted = [("src/model/scene.rs".to_owned(), "use crate::render::renderer::Renderer;\n".to_owned())];
+    assert_eq!(arrows_up(&planted, &rooms("")).len(), 1);
+}
+
+/// Crates of the project that a manifest uses, tests aside, by the ends of their names.
+fn used_crates(manifest: &str) -> BTreeSet<&str> {
+    let after = manifest.split("\n[dependencies]\n").nth(1).unwrap_or("");
+    let used = after.split("\n[").next().unwrap().lines().filter(|line| line.starts_with("nertca-vk"));
+    used.map(|line| line.split(['.', ' ']).next().unwrap().trim_start_matches("nertca-vk").trim_start_matches('-'))
+        .collect()
+}
+
+#[test]
+fn crates_use_only_crates_below_them() {
+    let name = |folder: &str| {
+        let manifest = of_crate(folder, "Cargo.toml");
+        let named = manifest.split("\n[package]\n").last().unwrap().split("name = \"nertca-vk").nth(1).unwrap();
+        named.split('"').next().unwrap().trim_start_matches('-').to_owned()
+    };
+    let names: Vec<String> = CRATES.iter().map(|folder| name(folder)).collect();
+    for (at, folder) in CRATES.iter().enumerate() {
+        let manifest = of_crate(folder, "Cargo.toml");
+        for used in used_crates(&manifest) {
+            assert!(names[..at].iter().any(|below| below == used), "{folder} uses {used}, which is not below it");
+        }
+    }
+    let mut all: BTreeSet<String> = files("crates").into_iter().map(|(path, _)| path).collect();
+    all.retain(|path| !CRATES.iter().any(|folder| path.starts_with(&format!("{folder}/src/")) && !folder.is_empty()));
+    all.retain(|path| !path.ends_with("/build.rs") && !path.contains("/benches/"));
+    assert!(all.is_empty(), "files of crates without a place: {all:?}");
+    assert_eq!(used_crates("a\n[dependencies]\nnertca-vk = { }\nnertca-vk-gpu.workspace = true\n").len(), 2);
+}
+
+#[test]
+fn angiograms_need_no_device() {
+    for folder in ["crates/angiograms", "crates/import"] {
+        let of_a_device: Vec<String> = sources(folder)
+            .into_iter()
+            .filter(|(_, text)| code(text).any(|line| line.contains("nertca_vk_gpu") || line.contains("ash::")))
+            .map(|(path, _)| path)
+            .collect();
+        // The error type has the errors of a device, if the feature `gpu` asks for them.
+        let expected: &[&str] = if folder == "crates/angiograms" { &["src/error.rs"] } else { &[] };
+        assert_eq!(of_a_device, expected, "{folder}");
+    }
 }
 
 /// Paths that a `use` names, without the keyword: `a::{b, c::d}` names `a::b` and `a::c::d`.
@@ -146,19 +216,19 @@ fn circles(uses: &BTreeMap<String, BTreeSet<String>>) -> BTreeSet<BTreeSet<Strin
 
 #[test]
 fn few_rooms_have_circles_inside() {
-    let sources = files("src");
-    let found: Vec<String> = circles(&uses(&sources))
-        .iter()
-        .map(|circle| circle.first().unwrap().split("::").next().unwrap().to_owned())
-        .collect();
-    // A preset of a method is a whole configuration, which contains the settings of the method.
-    assert_eq!(found, ["config", "kernels", "network"]);
-    // The crate of Vulkan compute has one, of device, memory and recordings.
-    for (name, expected) in [("gpu", 1), ("formats", 0), ("study", 0), ("cli", 0)] {
-        let folder = format!("crates/{name}/src");
-        let sources: Vec<_> =
-            files(&folder).into_iter().map(|(path, text)| (path.replace(&folder, "src"), text)).collect();
-        assert!(!sources.is_empty() && circles(&uses(&sources)).len() == expected, "{name}");
+    let rooms_with_one = |folder: &str| -> Vec<String> {
+        let room = |circle: &BTreeSet<String>| circle.first().unwrap().split("::").next().unwrap().to_owned();
+        circles(&uses(&sources(folder))).iter().map(room).collect()
+    };
+    for folder in CRATES {
+        let expected: &[&str] = match folder {
+            // A preset of a method is a whole configuration, which contains the settings of the method.
+            "" => &["config", "kernels", "network"],
+            // Device, memory and recordings.
+            "crates/gpu" => &["buffer"],
+            _ => &[],
+        };
+        assert_eq!(rooms_with_one(folder), expected, "{folder}");
     }
     // A new circle is seen.
     let planted =
@@ -201,8 +271,8 @@ fn no_method_uses_another() {
 
 #[test]
 fn a_method_is_named_by_few_files_outside_its_room() {
-    // Registry and library root, configuration, and the runner of self-tests are where a method is named.
-    let allowed = ["src/methods", "src/config", "src/lib.rs", "src/selftest"];
+    // Registry and library root, and the configuration are where a method is named.
+    let allowed = ["src/methods", "src/config", "src/lib.rs"];
     for (method, words) in METHODS {
         let outside: Vec<String> = files("src")
             .into_iter()
@@ -211,8 +281,8 @@ fn a_method_is_named_by_few_files_outside_its_room() {
             })
             .map(|(path, _)| path)
             .collect();
-        // A refusal for users, and the constants that the build makes from shaders.
-        let known: &[&str] = if method == "sax_nerf" { &["src/calibrate.rs", "src/kernels/constants.rs"] } else { &[] };
+        // The constants that the build makes from shaders.
+        let known: &[&str] = if method == "sax_nerf" { &["src/kernels/constants.rs"] } else { &[] };
         assert_eq!(outside, known, "{method}");
     }
 }

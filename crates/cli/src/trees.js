@@ -13,7 +13,7 @@ const trees = (() => {
   const mix = (a, b, share) => a + (b - a) * share;
   const colour = branch => COLOURS[branch % COLOURS.length];
 
-  // Returns the projection of a C-arm onto a picture of `side` x `side` pixels, like `CArm::rays` of src/geometry.rs.
+  // Returns the projection of a C-arm onto a picture of `side` x `side` pixels, like `CArm::rays` of crates/angiograms/src/geometry.rs.
   function cArmProjection(cArm, primary, secondary, side) {
     const [a, b] = [primary, secondary].map(degrees => degrees * Math.PI / 180);
     const columns = [Math.cos(a), Math.sin(a), 0];
