@@ -5,7 +5,7 @@
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::files;
-use crate::fitting::fit::{FitField, FitState, SavedAt, SavedFit};
+use crate::fitting::fit::{FitField, FitState, SavedAt, SavedFit, SavedState};
 use crate::gaussians::tensors::{self as gaussian_tensors, FORMAT as GAUSSIAN_FORMAT, GaussianHeader};
 use crate::geometry::CArm;
 use crate::methods;
@@ -199,7 +199,8 @@ impl Checkpoint {
     pub fn to_bytes(&self) -> Result<Vec<u8>> {
         let model = &self.model;
         let mut tensors: Vec<FileTensor> = model.gaussians.as_ref().map(gaussian_tensors::tensors).unwrap_or_default();
-        tensors.extend(self.fit.tensors(model)?);
+        let SavedState { tensors: of_fit, sections } = self.fit.saved(model)?;
+        tensors.extend(of_fit);
         if let Some(hull) = &model.hull {
             let bytes = hull.bits.iter().flat_map(|w| w.to_le_bytes()).collect();
             tensors.push((HULL_BITS.into(), Dtype::U32, vec![hull.bits.len()], bytes));
@@ -212,15 +213,15 @@ impl Checkpoint {
                     .map_err(|e| Error::Internal(format!("{name}: {e}")))
             })
             .collect::<Result<Vec<_>>>()?;
-        let metadata = HashMap::from([("nertca".to_owned(), self.header()?)]);
+        let metadata = HashMap::from([("nertca".to_owned(), self.header(sections)?)]);
         safetensors::serialize(views, Some(metadata)).map_err(|e| Error::Internal(e.to_string()))
     }
 
-    /// Returns the header, with the sections that field and state need.
-    fn header(&self) -> Result<String> {
+    /// Returns the header, with the `sections` of the state and that of the field.
+    fn header(&self, sections: Vec<(&'static str, String)>) -> Result<String> {
         let model = &self.model;
         let header = Header {
-            format: methods::of(&model.config).checkpoint_format().into(),
+            format: methods::of(&model.config).checkpoint_format.into(),
             gaussians: model.gaussians.as_ref().map(gaussian_tensors::header),
             config: model.config.clone(),
             scene: model.scene.clone(),
@@ -234,7 +235,7 @@ impl Checkpoint {
             hull: model.hull.as_ref().map(HullHeader::of),
         };
         let mut text = serde_json::to_string(&header).map_err(|e| Error::Internal(e.to_string()))?;
-        for (key, section) in self.fit.sections()? {
+        for (key, section) in sections {
             text = with_section(&text, key, &section);
         }
         if let Some(field) = &model.field {
@@ -255,7 +256,8 @@ impl Checkpoint {
     /// [`Error::Internal`] for the state of another method.
     pub fn state<T: Any>(&self) -> Result<&T> {
         let other = || Error::Internal("the state of the fit is that of another method".into());
-        self.fit.as_any().downcast_ref().ok_or_else(other)
+        let state: &dyn Any = &*self.fit;
+        state.downcast_ref().ok_or_else(other)
     }
 
     /// Reads a checkpoint file.
@@ -285,7 +287,7 @@ impl Checkpoint {
         let tensors = SafeTensors::deserialize(bytes).map_err(|e| bad("tensors", e.to_string()))?;
         let file = File { tensors: &tensors, path };
         let at = SavedAt { n_phases: header.phases, step: header.step };
-        let SavedFit { field, state } = methods::of(&header.config).read(&sections, &header.config, at, &file)?;
+        let SavedFit { field, state } = (methods::of(&header.config).read)(&sections, &header.config, at, &file)?;
         let hull = header.hull.map(|hull| hull.read(&file, header.phases)).transpose()?;
         let model = Model {
             param_map: ParamMap::new(&header.config, header.phases),
@@ -307,13 +309,13 @@ impl Checkpoint {
 /// Refuses a format that no method has, and one that is not that of the file's configuration.
 fn check_format(header: &Header, path: &Path) -> Result<()> {
     let bad = |field: &str, problem: String| Err(Error::data(path, field, problem));
-    let known: BTreeSet<&str> = methods::METHODS.iter().map(|method| method.checkpoint_format()).collect();
+    let known: BTreeSet<&str> = methods::METHODS.iter().map(|method| method.checkpoint_format).collect();
     if !known.contains(header.format.as_str()) {
         let known: Vec<&str> = known.into_iter().collect();
         let problem = format!("`{}` is not supported; this version reads {}", header.format, known.join(", "));
         return bad("format", problem);
     }
-    let needed = methods::of(&header.config).checkpoint_format();
+    let needed = methods::of(&header.config).checkpoint_format;
     if header.format != needed {
         return bad("format", format!("is `{}`, but the file's configuration needs `{needed}`", header.format));
     }

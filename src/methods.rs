@@ -8,28 +8,20 @@ pub mod sax_nerf;
 pub mod x_gaussian;
 
 use crate::config::Config;
-use crate::config::method::MethodKind;
 use crate::fitting::fit::Method;
-use dynamic_gaussians::DynamicGaussiansMethod;
 
 /// All methods.
-pub static METHODS: &[&dyn Method] = &[
-    &nert_ca::NertCa,
-    &nerf_ca::NerfCa,
-    &DynamicGaussiansMethod,
-    &r2_gaussian::R2Gaussian,
-    &x_gaussian::XGaussian,
-    &sax_nerf::SaxNerf,
+pub static METHODS: [&Method; 6] = [
+    &nert_ca::METHOD,
+    &nerf_ca::METHOD,
+    &dynamic_gaussians::METHOD,
+    &r2_gaussian::METHOD,
+    &x_gaussian::METHOD,
+    &sax_nerf::METHOD,
 ];
 
 /// Returns the method that a configuration chooses.
-pub fn of(config: &Config) -> &'static dyn Method {
-    match config.method() {
-        MethodKind::NertCa => &nert_ca::NertCa,
-        MethodKind::NerfCa => &nerf_ca::NerfCa,
-        MethodKind::DynamicGaussians => &DynamicGaussiansMethod,
-        MethodKind::R2Gaussian => &r2_gaussian::R2Gaussian,
-        MethodKind::XGaussian => &x_gaussian::XGaussian,
-        MethodKind::SaxNerf => &sax_nerf::SaxNerf,
-    }
+pub fn of(config: &Config) -> &'static Method {
+    let [first, others @ ..] = METHODS;
+    others.into_iter().find(|method| method.kind == config.method()).unwrap_or(first)
 }

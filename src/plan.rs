@@ -44,15 +44,15 @@ impl Plan {
             return Err(Error::config("dataset", n_pixels, "at most 2^30 training pixels are supported"));
         }
         let mut notes = Vec::new();
-        let PlannedFit { scene, data } = methods::of(config).plan(config, dataset, &mut notes)?;
+        let PlannedFit { scene, hull, empty_loss, data } = (methods::of(config).plan)(config, dataset, &mut notes)?;
         let values = dataset.training().iter().flat_map(|frame| &frame.integrals);
         let range = |[low, high]: [f32; 2], value: &f32| [low.min(*value), high.max(*value)];
         Ok(Plan {
             config: config.clone(),
             scene,
             params: ParamMap::new(config, dataset.n_phases as usize),
-            hull: data.hull().cloned(),
-            empty_loss: data.empty_loss(),
+            hull,
+            empty_loss,
             image_range: values.fold([f32::INFINITY, f32::NEG_INFINITY], range),
             notes,
             data: Some(data),
@@ -61,7 +61,8 @@ impl Plan {
 
     /// Returns the number of fits whose mean the field of a configuration is, for the data of this plan.
     pub fn fits(&self, config: &Config) -> u32 {
-        self.data.as_ref().map_or(1, |data| data.fits(config))
+        let repeats = methods::of(config).abilities.repeat_fits;
+        repeats.zip(self.data.as_ref()).map_or(1, |(repeats, data)| (repeats.count)(&**data, config))
     }
 
     /// Returns this plan in a known scene, for example when resuming.
@@ -77,7 +78,8 @@ impl Plan {
     /// # Errors
     /// [`Error::Internal`] for data of another method.
     pub fn data<T: Any>(&self) -> Result<&T> {
-        self.data.as_ref().and_then(|data| data.as_any().downcast_ref()).ok_or_else(other_method)
+        let data: Option<&dyn Any> = self.data.as_deref().map(|data| data as &dyn Any);
+        data.and_then(|data| data.downcast_ref()).ok_or_else(other_method)
     }
 
     /// Returns the data of the fit as the type of their method, to change them.
@@ -85,7 +87,8 @@ impl Plan {
     /// # Errors
     /// [`Error::Internal`] for data of another method.
     pub fn data_mut<T: Any>(&mut self) -> Result<&mut T> {
-        self.data.as_mut().and_then(|data| data.as_any_mut().downcast_mut()).ok_or_else(other_method)
+        let data: Option<&mut dyn Any> = self.data.as_deref_mut().map(|data| data as &mut dyn Any);
+        data.and_then(|data| data.downcast_mut()).ok_or_else(other_method)
     }
 }
 

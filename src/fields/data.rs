@@ -5,6 +5,7 @@ use crate::config::{Config, DynamicTarget};
 use crate::error::{Error, Result};
 use crate::fields::motion::ViewMotion;
 use crate::fields::start::StartRays;
+use crate::fitting::fit::PlannedFit;
 use crate::kernels::layout::{self, Setup};
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
@@ -131,6 +132,13 @@ impl FieldData {
             hull,
             empty_loss,
         })
+    }
+}
+
+impl From<FieldData> for PlannedFit {
+    fn from(data: FieldData) -> PlannedFit {
+        let (scene, hull, empty_loss) = (data.scene.clone(), data.hull.clone(), data.empty_loss);
+        PlannedFit { scene, hull, empty_loss, data: Box::new(data) }
     }
 }
 

@@ -2,8 +2,7 @@
 
 use crate::config::{Config, StaticForm};
 use crate::error::{Error, Result};
-use crate::fitting::fit::{FitField, FitState, PendingFit, SavedAt, SavedFit};
-use crate::gaussians::field::DynamicGaussians;
+use crate::fitting::fit::{FitField, FitState, SavedAt, SavedFit, SavedState};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Commands, Ticket};
@@ -14,7 +13,6 @@ use crate::model::params::ParamMap;
 use crate::tensors::{File, FileTensor};
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
-use std::any::Any;
 use std::sync::Arc;
 
 /// Bytes of an iteration's report.
@@ -79,7 +77,7 @@ struct Sections {
 }
 
 impl FitState for FieldsState {
-    fn tensors(&self, model: &Model) -> Result<Vec<FileTensor>> {
+    fn saved(&self, model: &Model) -> Result<SavedState> {
         let mut tensors: Vec<FileTensor> = Vec::new();
         for tensor in model.param_map.tensors() {
             let gather = |value: &dyn Fn(usize) -> f32| -> Vec<u8> {
@@ -100,10 +98,6 @@ impl FitState for FieldsState {
                 tensors.push((name.into(), Dtype::U32, vec![words.len()], bytes));
             }
         }
-        Ok(tensors)
-    }
-
-    fn sections(&self) -> Result<Vec<(&'static str, String)>> {
         let mut sections = Vec::new();
         if let Some(scale) = self.loss_scale {
             sections.push(("loss_scale", serde_json::to_string(&scale).map_err(|e| Error::Internal(e.to_string()))?));
@@ -111,11 +105,7 @@ impl FitState for FieldsState {
         if self.stopped {
             sections.push(("stopped", "true".into()));
         }
-        Ok(sections)
-    }
-
-    fn as_any(&self) -> &dyn Any {
-        self
+        Ok(SavedState { tensors, sections })
     }
 }
 
@@ -202,8 +192,12 @@ pub(crate) struct PendingFields {
     pub(super) advice: &'static str,
 }
 
-impl PendingFit for PendingFields {
-    fn wait(self: Box<Self>) -> Result<SavedFit> {
+impl PendingFields {
+    /// Waits until the device has come this far.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] when a parameter is not finite; device errors.
+    pub(crate) fn wait(self) -> Result<SavedFit> {
         self.gpu.wait(self.ticket)?;
         let mut params = vec![0f32; self.n_params];
         self.params.read(&mut params)?;
@@ -227,21 +221,5 @@ impl PendingFit for PendingFields {
         let state = FieldsState { step: self.step, moments, occupancy, loss_scale, stopped, last_report };
         let field = FitField { params, hull: self.hull, ..FitField::default() };
         Ok(SavedFit { field, state: Arc::new(state) })
-    }
-}
-
-/// Static field and its state on their way to the host, behind Gaussians that are there already.
-pub(crate) struct PendingBehind {
-    /// The static field.
-    pub(crate) fields: Box<PendingFields>,
-    /// The Gaussians.
-    pub(crate) gaussians: DynamicGaussians,
-}
-
-impl PendingFit for PendingBehind {
-    fn wait(self: Box<Self>) -> Result<SavedFit> {
-        let SavedFit { field, state } = self.fields.wait()?;
-        // Gaussians need no hull once they are seeded.
-        Ok(SavedFit { field: FitField { gaussians: Some(self.gaussians), hull: None, ..field }, state })
     }
 }

@@ -1,7 +1,6 @@
 //! Owns the buffers and the step count of the fields that rays are marched through; hands iterations to the device, two submits in
 //! flight on a GPU, and reads losses without stalling it.
 
-use crate::choice::Choice;
 use crate::error::{Error, Result};
 use crate::fields::data::FieldData;
 use crate::fields::images::TrainingImages;
@@ -9,7 +8,9 @@ use crate::fields::setup::sample_capacity;
 use crate::fields::state::{FieldsState, LossScale, PendingFields, REPORT_BYTES};
 use crate::fields::step::{TrainingBuffers, clear, forward_buffers, record_step};
 use crate::fitting::RING_LENGTH;
-use crate::fitting::fit::{Beginning, FieldFeed, Fit, FitData, FitField, FitStart, PendingFit, SavedFit, TimedFit};
+use crate::fitting::fit::{
+    Advance, FieldFeed, Fit, FitData, FitField, FitProgress, FitStart, Iterates, Measured, PendingFit, Start, Use,
+};
 use crate::fitting::ledger::{Ledger, StageWork, add};
 use crate::fitting::losses::{NetworkLosses, SMALLER_STEPS, SMALLER_STEPS_WITH_A_NETWORK, StepLoss};
 use crate::fitting::ring::tells_nothing;
@@ -20,14 +21,12 @@ use crate::gpu::record::{Commands, PassTime, Recording, Ticket};
 use crate::kernels::layout::{DeviceState, Setup, StepReport};
 use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::{Layers, Tuning};
-use crate::model::hull::Hull;
 use crate::model::scene::Scene;
 use crate::network::forward::{ForwardBuffers, occupancy_bytes};
 use crate::network::pass::Pass;
 use crate::network::static_network::StaticNetwork;
 use crate::network::{F32_BYTES, Network, Purpose, largest_chunk};
 use crate::scan::pixels::Pixels;
-use std::any::Any;
 use std::collections::VecDeque;
 use std::time::Instant;
 
@@ -76,17 +75,10 @@ pub(crate) struct SavedFields<'a> {
 }
 
 impl<'a> SavedFields<'a> {
-    /// Returns what was saved of fields; none for a fit without fields.
-    pub(crate) fn of(saved: &'a SavedFit) -> Option<SavedFields<'a>> {
-        Some(SavedFields { params: &saved.field.params, state: saved.state.as_any().downcast_ref()? })
-    }
-
     /// Returns the fields from which a fit begins; none if it begins from scratch.
-    pub(crate) fn at(from: Beginning<'a>) -> Option<SavedFields<'a>> {
-        match from {
-            Beginning::Resumed(saved) | Beginning::CarriedOn(saved) => SavedFields::of(saved),
-            Beginning::Scratch | Beginning::Prepared(_) | Beginning::AfterGaussians(_) => None,
-        }
+    pub(crate) fn at(from: Start<'a>) -> Option<SavedFields<'a>> {
+        let (field, _) = from.field.filter(|(_, used)| *used != Use::Show)?;
+        Some(SavedFields { params: &field.params, state: from.state_as()? })
     }
 
     /// Returns the number of iterations done.
@@ -358,16 +350,12 @@ impl FieldsFit {
     }
 }
 
-impl Fit for FieldsFit {
-    fn step(&self) -> u32 {
-        self.completed
+impl Iterates for FieldsFit {
+    fn progress(&self) -> FitProgress {
+        FitProgress { submitted: self.submitted, ..FitProgress::at(self.completed) }
     }
 
-    fn submitted(&self) -> u32 {
-        self.submitted
-    }
-
-    fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
+    fn advance(&mut self, until: u32) -> Result<Advance> {
         self.record_several()?;
         if self.in_flight.is_empty() {
             self.last_completion = Instant::now();
@@ -388,7 +376,7 @@ impl Fit for FieldsFit {
             self.in_flight.push_back((commands.submit()?, n));
             self.submitted += n;
         }
-        let Some((ticket, n)) = self.in_flight.pop_front() else { return Ok(Vec::new()) };
+        let Some((ticket, n)) = self.in_flight.pop_front() else { return Ok(Advance::default()) };
         self.gpu.wait(ticket)?;
         self.completed += n;
         self.pace.note(n, self.last_completion.elapsed().as_secs_f64());
@@ -396,9 +384,11 @@ impl Fit for FieldsFit {
         if self.completed == starts {
             self.pace.restart();
         }
-        self.read_losses()
+        Ok(Advance::of(self.read_losses()?))
     }
+}
 
+impl Fit for FieldsFit {
     fn outline(&self) -> FitField {
         FitField { hull: self.data.hull.clone(), ..FitField::default() }
     }
@@ -407,10 +397,17 @@ impl Fit for FieldsFit {
         FieldFeed { params: Some(self.forward.params.clone()), ..FieldFeed::default() }
     }
 
-    fn snapshot(&self) -> Result<Box<dyn PendingFit>> {
-        Ok(Box::new(self.pending()?))
+    fn snapshot(&self) -> Result<PendingFit> {
+        let pending = self.pending()?;
+        Ok(Box::new(|| pending.wait()))
     }
 
+    fn measured(&mut self) -> Option<&mut dyn Measured> {
+        Some(self)
+    }
+}
+
+impl Measured for FieldsFit {
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         const MAX_PASSES: u32 = 4096;
         let mut recording = Recording::timed(&self.gpu, "profiled iteration", MAX_PASSES)?;
@@ -419,10 +416,6 @@ impl Fit for FieldsFit {
         self.gpu.wait(commands.submit()?)?;
         self.count(1);
         Ok(commands.pass_times()?)
-    }
-
-    fn tuning(&self) -> Option<&Tuning> {
-        Some(&self.kernels.tuning)
     }
 
     fn barriers(&self) -> Option<u32> {
@@ -440,33 +433,13 @@ impl Fit for FieldsFit {
         add(&mut ledger, "adam", StageWork::per_item(self.data.params.len as u64, 0, 7 * F32_BYTES));
         ledger
     }
-
-    fn as_any(&self) -> &dyn Any {
-        self
-    }
 }
 
 impl FitData for FieldData {
-    fn begin(&self, start: &FitStart<'_>, _: &mut Vec<String>) -> Result<Box<dyn Fit>> {
+    fn begin(self: Box<Self>, start: &FitStart<'_>, _: &mut Vec<String>) -> Result<Box<dyn Fit>> {
         let saved = SavedFields::at(start.from);
         let done = saved.map_or(0, |saved| saved.step());
-        Ok(Box::new(FieldsFit::new(start.gpu, self.clone(), start.tuning.clone(), saved, done)?))
-    }
-
-    fn begin_timed(&self, _: &FitStart<'_>) -> Result<Box<dyn TimedFit>> {
-        Err(Error::config(
-            "gaussians.form",
-            self.config.gaussians.form.name(),
-            "this configuration has no Gaussians to time",
-        ))
-    }
-
-    fn hull(&self) -> Option<&Hull> {
-        self.hull.as_ref()
-    }
-
-    fn empty_loss(&self) -> Option<f64> {
-        self.empty_loss
+        Ok(Box::new(FieldsFit::new(start.gpu, *self, start.tuning.clone(), saved, done)?))
     }
 
     fn set_scene(&mut self, scene: &Scene) {
@@ -480,13 +453,5 @@ impl FitData for FieldData {
             ..scene.setup(&self.config, &self.params, self.hull.as_ref())
         };
         self.scene = scene.clone();
-    }
-
-    fn as_any(&self) -> &dyn Any {
-        self
-    }
-
-    fn as_any_mut(&mut self) -> &mut dyn Any {
-        self
     }
 }

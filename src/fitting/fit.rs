@@ -1,4 +1,4 @@
-//! Traits behind which each method stands: its entry in the registry, the data of a fit, the fit, and the state that a checkpoint
+//! Interfaces behind which each method stands: its entry in the registry, the data of a fit, the fit, and the state that a checkpoint
 //! keeps of it.
 
 use crate::calibrate::adjustment::Adjusted;
@@ -24,60 +24,60 @@ use std::any::Any;
 use std::fmt::Debug;
 use std::sync::Arc;
 
-/// A method of reconstruction with settings, data, stages and a field of its own.
-pub trait Method: Sync {
-    /// Returns the entry of the configuration that chooses this method.
-    fn kind(&self) -> MethodKind;
-
-    /// Returns the name of the format of the method's checkpoints.
-    fn checkpoint_format(&self) -> &'static str;
-
-    /// Prepares a fit: chooses the boxes and scales of the fields and collects the data. Remarks for the user are appended to
-    /// `notes`.
-    ///
-    /// # Errors
-    /// [`Error::Config`] when dataset and configuration do not fit.
-    fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit>;
-
-    /// Reads the field and the state of its fit from a checkpoint, whose header has these `sections`.
-    ///
-    /// # Errors
-    /// [`Error::Data`] naming what is missing, misshapen or not finite.
-    fn read(&self, sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit>;
-
-    /// Adjusts the calibrated geometry of views with the field in the loop; `None` where the method or the data do not allow it.
-    ///
-    /// # Errors
-    /// Device errors, and errors of `observe`.
-    fn adjust(&self, _task: &AdjustTask<'_>, _observe: &mut Observe<'_>) -> Result<Option<AdjustedFit>> {
-        Ok(None)
-    }
-
-    /// Estimates the memory of a run, from the number and the size of its images, on a device whose buffers have at most `max_buffer`
-    /// bytes; none where the method has no estimate.
-    fn memory(&self, _config: &Config, _dataset: &Dataset, _max_buffer: u64) -> Option<MemoryEstimate> {
-        None
-    }
-
-    /// Returns the rays of an iteration; 0 for a method that draws whole images.
-    fn rays_per_iteration(&self, config: &Config) -> u32;
-
-    /// Lowers the learning rates by a factor, for measurements whose field is to stay as it is.
-    fn lower_rates(&self, config: &mut Config, factor: f64);
-
-    /// Returns the settings that make the method's steps smaller, as advice for a run that diverged.
-    fn smaller_steps(&self) -> &'static str;
-
+/// A method of reconstruction, as the registry has it: what others must know of it, what each method does, and what only some can do.
+pub struct Method {
+    /// Entry of the configuration that chooses this method.
+    pub kind: MethodKind,
+    /// Name of the format of the method's checkpoints.
+    pub checkpoint_format: &'static str,
+    /// Settings that make the method's steps smaller, as advice for a run that diverged.
+    pub smaller_steps: &'static str,
+    /// Whether the boxes of the fields hold all rays and do not bound the fields, so that they may grow with new images.
+    pub boxes_hold_all_rays: bool,
+    /// Prepares a fit: chooses the boxes and scales of the fields and collects the data. Remarks for the user are appended to the notes.
+    /// Fails with [`Error::Config`] when dataset and configuration do not fit.
+    pub plan: fn(&Config, &Dataset, &mut Vec<String>) -> Result<PlannedFit>,
+    /// Reads the field and the state of its fit from a checkpoint, whose header has these sections. Fails with [`Error::Data`] naming
+    /// what is missing, misshapen or not finite.
+    pub read: fn(&serde_json::Value, &Config, SavedAt, &File<'_>) -> Result<SavedFit>,
     /// Builds the pipelines that only this method uses, for the inventory of compiled pipelines.
-    ///
-    /// # Errors
-    /// Device errors.
-    fn make_pipelines(&self, gpu: &Gpu, config: &Config, tuning: &Tuning) -> Result<()>;
+    pub make_pipelines: fn(&Gpu, &Config, &Tuning) -> Result<()>,
+    /// Returns the rays of an iteration; 0 for a method that draws whole images.
+    pub rays_per_iteration: fn(&Config) -> u32,
+    /// Lowers the learning rates by a factor, for measurements whose field is to stay as it is.
+    pub lower_rates: fn(&mut Config, f64),
+    /// Abilities that only some methods have.
+    pub abilities: Abilities,
+}
 
-    /// Tells whether the boxes of the fields hold all rays and do not bound the fields, so that they may grow with new images.
-    fn boxes_hold_all_rays(&self) -> bool {
-        false
-    }
+/// Abilities that only some methods have.
+#[derive(Clone, Copy)]
+pub struct Abilities {
+    /// Adjusts the calibrated geometry of views with the field in the loop; returns none where the data do not allow it. Fails with
+    /// errors of the device and of the observer.
+    pub adjust_views: Option<fn(&AdjustTask<'_>, &mut Observe<'_>) -> Result<Option<AdjustedFit>>>,
+    /// Estimates the memory of a run, from the number and the size of its images, on a device whose buffers have at most this many
+    /// bytes; returns none for settings without an estimate.
+    pub estimate_memory: Option<fn(&Config, &Dataset, u64) -> Option<MemoryEstimate>>,
+    /// Repeats fits to the same data, whose mean is the field.
+    pub repeat_fits: Option<RepeatFits>,
+    /// Begins a fit from scratch for measurements of its Gaussians.
+    pub time_gaussians: Option<fn(&dyn FitData, &FitStart<'_>) -> Result<Box<dyn Measured>>>,
+}
+
+impl Abilities {
+    /// Returns the abilities of a method that has none.
+    pub const NONE: Abilities =
+        Abilities { adjust_views: None, estimate_memory: None, repeat_fits: None, time_gaussians: None };
+}
+
+/// Ability to repeat fits to the same data, whose mean is the field.
+#[derive(Clone, Copy)]
+pub struct RepeatFits {
+    /// Returns the number of fits to these data.
+    pub count: fn(&dyn FitData, &Config) -> u32,
+    /// Changes settings that leave the number of fits to the data, so that there is a single one.
+    pub only_one: fn(&mut Config),
 }
 
 /// Estimate of the largest memory of a run.
@@ -111,30 +111,11 @@ pub struct AdjustedFit {
     /// Poses after it, and its record.
     pub adjusted: Adjusted,
     /// Fit to the views as they are after the adjustment; none where it was made with coarser images.
-    pub made: Option<MadeGaussians>,
+    pub made: Option<MadeFit>,
 }
 
-/// A fit of Gaussians that is done before its run begins.
-#[derive(Debug, Clone)]
-pub struct MadeGaussians {
-    /// The field after all iterations.
-    pub gaussians: DynamicGaussians,
-    /// Loss of each iteration.
-    pub losses: Vec<f64>,
-    /// Findings about the data, for the user.
-    pub findings: Vec<String>,
-    /// Fingerprint of the data and the settings of the fit.
-    pub fingerprint: String,
-}
-
-/// Gaussians that were fitted to the images of a run before it begins.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct PreparedGaussians<'a> {
-    /// Fit that is not repeated where it is one of the run's.
-    pub made: Option<&'a MadeGaussians>,
-    /// Field that is shown until the run has a better one.
-    pub shown: Option<&'a DynamicGaussians>,
-}
+/// Fit that was done before its run begins, of its method's own type.
+pub type MadeFit = Arc<dyn Any + Send + Sync>;
 
 /// Receives the share of a work that is done; an error ends the work.
 pub type Observe<'a> = dyn FnMut(f64) -> Result<()> + 'a;
@@ -143,8 +124,19 @@ pub type Observe<'a> = dyn FnMut(f64) -> Result<()> + 'a;
 pub struct PlannedFit {
     /// Scales and boxes of the fields.
     pub scene: Scene,
+    /// Motion hull that bounds the dynamic field, if there is one.
+    pub hull: Option<Hull>,
+    /// Weighted loss of an empty dynamic field, where it is known.
+    pub empty_loss: Option<f64>,
     /// Data of the fit.
     pub data: Box<dyn FitData>,
+}
+
+impl PlannedFit {
+    /// Returns a fit to images, without a hull.
+    pub fn of_images(scene: Scene, data: impl FitData) -> PlannedFit {
+        PlannedFit { scene, hull: None, empty_loss: None, data: Box::new(data) }
+    }
 }
 
 /// Number of phases of the run and iteration at which a checkpoint was saved.
@@ -198,6 +190,8 @@ pub struct FieldFeed {
 /// Work of an iteration of Gaussians.
 #[derive(Debug, Clone, Copy)]
 pub struct FitWork {
+    /// Form of the Gaussians where the data decided it; none where the configuration states it.
+    pub form: Option<&'static str>,
     /// Number of Gaussians.
     pub count: u32,
     /// Work of the last iteration.
@@ -214,52 +208,71 @@ pub struct SavedFit {
 }
 
 /// State of a fit beside its field.
-pub trait FitState: Debug + Send + Sync {
-    /// Returns the tensors of a checkpoint: those of the state, and those of the model's field but for Gaussians and hull, which are
+pub trait FitState: Any + Debug + Send + Sync {
+    /// Returns the parts of a checkpoint: those of the state, and those of the model's field but for Gaussians and hull, which are
     /// written alike for all methods.
     ///
     /// # Errors
-    /// [`Error::Internal`] for a model of another method.
-    fn tensors(&self, model: &Model) -> Result<Vec<FileTensor>>;
-
-    /// Returns the sections of a checkpoint's header that the state needs, as keys and JSON.
-    ///
-    /// # Errors
-    /// [`Error::Internal`] when a section cannot be written as JSON.
-    fn sections(&self) -> Result<Vec<(&'static str, String)>> {
-        Ok(Vec::new())
-    }
-
-    /// Returns the state as its own type, for its method.
-    fn as_any(&self) -> &dyn Any;
+    /// [`Error::Internal`] for a model of another method, and for a section that cannot be written as JSON.
+    fn saved(&self, model: &Model) -> Result<SavedState>;
 }
 
-/// State from which a fit begins.
-#[derive(Debug, Clone, Copy)]
-pub enum Beginning<'a> {
-    /// The fit begins from scratch.
-    Scratch,
-    /// The fit begins from scratch, with Gaussians that were fitted before.
-    Prepared(PreparedGaussians<'a>),
+/// Parts of a checkpoint that hold the state of a fit.
+pub struct SavedState {
+    /// Tensors of the file.
+    pub tensors: Vec<FileTensor>,
+    /// Sections of the header, as keys and JSON.
+    pub sections: Vec<(&'static str, String)>,
+}
+
+impl SavedState {
+    /// Returns parts without a section.
+    pub fn of_tensors(tensors: Vec<FileTensor>) -> SavedState {
+        SavedState { tensors, sections: Vec::new() }
+    }
+}
+
+/// Use that a fit makes of an earlier field.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Use {
     /// The fit continues a fit to the same data; the result is that of an uninterrupted one.
-    Resumed(&'a SavedFit),
+    Resume,
     /// The fit goes on from a fit to other data, as far as the method can.
-    CarriedOn(&'a SavedFit),
-    /// Gaussians may go on from those of a fit to other data; all else begins from scratch.
-    AfterGaussians(&'a DynamicGaussians),
+    GoOn,
+    /// The fit begins from scratch, and the field is shown until there is a better one.
+    Show,
 }
 
-impl<'a> Beginning<'a> {
-    /// Returns the fit to the same data, if that is where the fit begins.
-    pub fn resumed(self) -> Option<&'a SavedFit> {
-        match self {
-            Beginning::Resumed(saved) => Some(saved),
-            _ => None,
-        }
+/// Results of earlier fits with which a fit begins; nothing for one from scratch.
+#[derive(Clone, Copy, Default)]
+pub struct Start<'a> {
+    /// Field of an earlier fit, and its use.
+    pub field: Option<(&'a FitField, Use)>,
+    /// State of the earlier fit; without it, only Gaussians are gone on from.
+    pub state: Option<&'a dyn FitState>,
+    /// Fit that is not repeated where it is one of the run's.
+    pub made: Option<&'a MadeFit>,
+}
+
+impl<'a> Start<'a> {
+    /// Returns the start from a saved fit.
+    pub fn of(saved: &'a SavedFit, used: Use) -> Start<'a> {
+        Start { field: Some((&saved.field, used)), state: Some(&*saved.state), made: None }
+    }
+
+    /// Returns the earlier field, if this is its use.
+    pub fn field_to(self, wanted: Use) -> Option<&'a FitField> {
+        self.field.and_then(|(field, used)| (used == wanted).then_some(field))
+    }
+
+    /// Returns the state of the earlier fit as the type of its method.
+    pub fn state_as<T: FitState>(self) -> Option<&'a T> {
+        let state: &dyn Any = self.state?;
+        state.downcast_ref()
     }
 }
 
-/// Device, settings and state with which a fit begins.
+/// Device, settings and earlier results with which a fit begins.
 #[derive(Clone, Copy)]
 pub struct FitStart<'a> {
     /// Device of the fit.
@@ -268,97 +281,84 @@ pub struct FitStart<'a> {
     pub config: &'a Config,
     /// Choices made for the device.
     pub tuning: &'a Tuning,
-    /// State from which the fit begins.
-    pub from: Beginning<'a>,
+    /// Earlier results with which the fit begins.
+    pub from: Start<'a>,
 }
 
 /// Data that a method is fitted to.
-pub trait FitData: Send {
-    /// Begins a fit. Remarks for the user are appended to `notes`.
+pub trait FitData: Any + Send {
+    /// Begins the fit to these data. Remarks for the user are appended to `notes`.
     ///
     /// # Errors
     /// [`Error::Config`] for impossible settings, for a saved fit of other sizes and where memory does not suffice; device errors.
-    fn begin(&self, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<Box<dyn Fit>>;
+    fn begin(self: Box<Self>, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<Box<dyn Fit>>;
 
-    /// Begins the only fit to these data, as [`FitData::begin`] does, and takes over their memory where the method can.
-    ///
-    /// # Errors
-    /// Errors of [`FitData::begin`].
-    fn begin_only(self: Box<Self>, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<Box<dyn Fit>> {
-        self.begin(start, notes)
-    }
-
-    /// Begins a fit from scratch for measurements of its Gaussians.
-    ///
-    /// # Errors
-    /// Errors of [`FitData::begin`]; [`Error::Config`] for a method without Gaussians.
-    fn begin_timed(&self, start: &FitStart<'_>) -> Result<Box<dyn TimedFit>> {
-        Ok(Box::new(self.begin(start, &mut Vec::new())?))
-    }
-
-    /// Returns the motion hull that bounds the dynamic field, if there is one.
-    fn hull(&self) -> Option<&Hull> {
-        None
-    }
-
-    /// Returns the number of fits whose mean the field of a configuration is.
-    fn fits(&self, _config: &Config) -> u32 {
-        1
-    }
-
-    /// Returns the weighted loss of an empty dynamic field, where it is known.
-    fn empty_loss(&self) -> Option<f64> {
-        None
-    }
-
-    /// Replaces scales and boxes of the fields, for example by those of a saved run.
-    fn set_scene(&mut self, _scene: &Scene) {}
-
-    /// Returns the data as their own type, for their method.
-    fn as_any(&self) -> &dyn Any;
-
-    /// Returns the data as their own type, to change them.
-    fn as_any_mut(&mut self) -> &mut dyn Any;
+    /// Replaces scales and boxes of the fields, for example by those of a saved run. Data that depend on neither stay as they are.
+    fn set_scene(&mut self, scene: &Scene);
 }
 
-/// A fit under way on a device.
-pub trait Fit: Send {
-    /// Returns the iterations done.
-    fn step(&self) -> u32;
+/// Returns the data of a fit as the type of their method.
+///
+/// # Errors
+/// [`Error::Internal`] for data of another method.
+pub fn data_as<T: FitData>(data: &dyn FitData) -> Result<&T> {
+    let data: &dyn Any = data;
+    data.downcast_ref().ok_or_else(|| Error::Internal("the data of the fit are those of another method".into()))
+}
 
-    /// Returns the iterations handed to the device.
-    fn submitted(&self) -> u32 {
-        self.step()
+/// Position of a fit.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FitProgress {
+    /// Iterations done.
+    pub step: u32,
+    /// Iterations handed to the device.
+    pub submitted: u32,
+    /// Share done of the preparation before the first iteration; none when that has begun.
+    pub preparation: Option<f64>,
+    /// Whether the field of earlier data is shown, until the fit has a better one.
+    pub shows_earlier: bool,
+}
+
+impl FitProgress {
+    /// Returns the position of a fit whose iterations have begun and of which none is on its way.
+    pub fn at(step: u32) -> FitProgress {
+        FitProgress { step, submitted: step, preparation: None, shows_earlier: false }
     }
+}
 
-    /// Returns the share done of the preparation before the first iteration; none when that has begun.
-    fn preparation(&self) -> Option<f64> {
-        None
+/// Outcome of a submit.
+#[derive(Debug, Default)]
+pub struct Advance {
+    /// Losses that became known.
+    pub losses: Vec<StepLoss>,
+    /// Settings that make steps smaller from now on, where the losses that follow are those of another objective.
+    pub smaller_steps: Option<&'static str>,
+    /// Findings about the data, as sentences for the user.
+    pub findings: Vec<String>,
+}
+
+impl Advance {
+    /// Returns the outcome of a submit that made losses known.
+    pub fn of(losses: Vec<StepLoss>) -> Advance {
+        Advance { losses, ..Advance::default() }
     }
+}
 
-    /// Tells whether the field of earlier data is shown, until the fit has a better one.
-    fn shows_earlier(&self) -> bool {
-        false
-    }
+/// Iterations under way on a device.
+pub trait Iterates: Any + Send {
+    /// Returns the position of the fit.
+    fn progress(&self) -> FitProgress;
 
-    /// Runs one submit of iterations towards `until` and returns the losses that became known. Work may be in flight afterwards
-    /// unless `until` is reached. No losses mean that `until` was reached before, or that the first iteration is still being
-    /// prepared.
+    /// Runs one submit of iterations towards `until` and returns what became known. Work may be in flight afterwards unless `until` is
+    /// reached. No losses mean that `until` was reached before, or that the first iteration is still being prepared.
     ///
     /// # Errors
     /// [`Error::Diverged`] on a loss that is not finite; device errors.
-    fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>>;
+    fn advance(&mut self, until: u32) -> Result<Advance>;
+}
 
-    /// Returns, once, the settings that make steps smaller from now on, when the losses that follow are those of another objective.
-    fn new_objective(&mut self) -> Option<&'static str> {
-        None
-    }
-
-    /// Returns findings about the data since the last call, as sentences for the user.
-    fn take_findings(&mut self) -> Vec<String> {
-        Vec::new()
-    }
-
+/// Fit of a method to the data of a run.
+pub trait Fit: Iterates {
     /// Returns the field as it is drawn now; without its numbers where these are on the device.
     fn outline(&self) -> FitField;
 
@@ -370,25 +370,30 @@ pub trait Fit: Send {
     ///
     /// # Errors
     /// [`Error::Diverged`] when a number is not finite; device errors.
-    fn snapshot(&self) -> Result<Box<dyn PendingFit>>;
+    fn snapshot(&self) -> Result<PendingFit>;
 
+    /// Returns the fit for measurements, where its method has any.
+    fn measured(&mut self) -> Option<&mut dyn Measured>;
+}
+
+/// Field and state of a fit on their way to the host: waits until the device has come this far. Fails with [`Error::Diverged`] when a
+/// number is not finite, and with errors of the device.
+pub type PendingFit = Box<dyn FnOnce() -> Result<SavedFit> + Send>;
+
+/// Fit whose iterations are measured.
+pub trait Measured: Iterates {
     /// Runs one iteration with a timestamp around each pass.
     ///
     /// # Errors
     /// [`Error::Internal`] when the fit is over; device errors.
     fn profile_step(&mut self) -> Result<Vec<PassTime>>;
 
-    /// Returns the work of the last iteration, for methods whose work depends on the size of their Gaussians.
+    /// Returns the work of the last iteration; none for a fit without Gaussians.
     ///
     /// # Errors
     /// Device errors.
     fn work(&self) -> Result<Option<FitWork>> {
         Ok(None)
-    }
-
-    /// Returns the choices made for the device, where the fit made more of them than were given.
-    fn tuning(&self) -> Option<&Tuning> {
-        None
     }
 
     /// Returns the number of barriers of an iteration, where it is known.
@@ -399,77 +404,5 @@ pub trait Fit: Send {
     /// Returns the minimum work of an iteration's stages with `live_samples` live samples; empty where it is not known.
     fn ledger(&self, _live_samples: u64) -> Ledger {
         Ledger::new()
-    }
-
-    /// Returns the fit as its own type, for tests and measurements.
-    fn as_any(&self) -> &dyn Any;
-}
-
-/// Field and state of a fit on their way to the host.
-pub trait PendingFit: Send {
-    /// Waits until the device has come this far.
-    ///
-    /// # Errors
-    /// [`Error::Diverged`] when a number is not finite; device errors.
-    fn wait(self: Box<Self>) -> Result<SavedFit>;
-}
-
-impl PendingFit for SavedFit {
-    fn wait(self: Box<Self>) -> Result<SavedFit> {
-        Ok(*self)
-    }
-}
-
-/// A fit of Gaussians whose iterations are timed.
-pub trait TimedFit {
-    /// Returns the form of the Gaussians where the data decided it; none where the configuration states it.
-    fn form(&self) -> Option<&'static str> {
-        None
-    }
-
-    /// Returns the iterations done.
-    fn step(&self) -> u32;
-
-    /// Tells whether the first iteration can begin.
-    fn is_prepared(&self) -> bool;
-
-    /// Runs one submit and returns the number of iterations that it did.
-    ///
-    /// # Errors
-    /// Errors of [`Fit::advance`].
-    fn advance(&mut self, until: u32) -> Result<usize>;
-
-    /// Returns the number of Gaussians and the work of the last iteration.
-    ///
-    /// # Errors
-    /// [`Error::Internal`] for a fit without Gaussians; device errors.
-    fn work(&self) -> Result<FitWork>;
-
-    /// Runs one iteration with a timestamp around each pass.
-    ///
-    /// # Errors
-    /// Errors of [`Fit::profile_step`].
-    fn profile_step(&mut self) -> Result<Vec<PassTime>>;
-}
-
-impl TimedFit for Box<dyn Fit> {
-    fn step(&self) -> u32 {
-        self.as_ref().step()
-    }
-
-    fn is_prepared(&self) -> bool {
-        self.preparation().is_none()
-    }
-
-    fn advance(&mut self, until: u32) -> Result<usize> {
-        self.as_mut().advance(until).map(|losses| losses.len())
-    }
-
-    fn work(&self) -> Result<FitWork> {
-        self.as_ref().work()?.ok_or_else(|| Error::Internal("the fit has no Gaussians".into()))
-    }
-
-    fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        self.as_mut().profile_step()
     }
 }

@@ -1,12 +1,13 @@
 //! Fits of static methods whose field consists of Gaussians, which are drawn while the fit runs.
 
 use crate::error::Result;
-use crate::fitting::fit::{FieldFeed, Fit, FitField, FitState, FitWork, PendingFit, SavedFit};
+use crate::fitting::fit::{
+    Advance, FieldFeed, Fit, FitField, FitProgress, FitState, FitWork, Iterates, Measured, PendingFit, SavedFit,
+};
 use crate::fitting::losses::StepLoss;
 use crate::gaussians::field::{DynamicGaussians, GaussianFeed, Gaussians};
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::record::PassTime;
-use std::any::Any;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Iterations between updates of the Gaussians that are drawn: with half a million Gaussians per phase an update takes as long as
@@ -86,12 +87,12 @@ fn is_due(before: u32, now: u32, until: u32) -> bool {
     now >= until || now / SHOWN_EVERY > before / SHOWN_EVERY
 }
 
-impl<T: SetsFit + 'static> Fit for ShownFit<T> {
-    fn step(&self) -> u32 {
-        self.fit.step()
+impl<T: SetsFit + 'static> Iterates for ShownFit<T> {
+    fn progress(&self) -> FitProgress {
+        FitProgress::at(self.fit.step())
     }
 
-    fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
+    fn advance(&mut self, until: u32) -> Result<Advance> {
         let before = self.fit.step();
         let losses = self.fit.advance(until)?;
         if is_due(before, self.fit.step(), until) {
@@ -99,9 +100,13 @@ impl<T: SetsFit + 'static> Fit for ShownFit<T> {
             let mut feed = self.feed.lock().unwrap_or_else(PoisonError::into_inner);
             *feed = (feed.0 + 1, DynamicGaussians::PerPhase(field));
         }
-        Ok(losses.into_iter().zip(before + 1..).map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect())
+        Ok(Advance::of(
+            losses.into_iter().zip(before + 1..).map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect(),
+        ))
     }
+}
 
+impl<T: SetsFit + 'static> Fit for ShownFit<T> {
     fn outline(&self) -> FitField {
         let shown = self.feed.lock().unwrap_or_else(PoisonError::into_inner).1.clone();
         FitField::of_gaussians(shown)
@@ -111,22 +116,25 @@ impl<T: SetsFit + 'static> Fit for ShownFit<T> {
         FieldFeed { gaussians: Some(self.feed.clone()), ..FieldFeed::default() }
     }
 
-    fn snapshot(&self) -> Result<Box<dyn PendingFit>> {
+    fn snapshot(&self) -> Result<PendingFit> {
         let state = self.fit.state()?;
         let field = DynamicGaussians::PerPhase(self.fit.field_of(&state));
-        Ok(Box::new(SavedFit { field: FitField::of_gaussians(field), state: Arc::new(state) }))
+        let saved = SavedFit { field: FitField::of_gaussians(field), state: Arc::new(state) };
+        Ok(Box::new(|| Ok(saved)))
     }
 
+    fn measured(&mut self) -> Option<&mut dyn Measured> {
+        Some(self)
+    }
+}
+
+impl<T: SetsFit + 'static> Measured for ShownFit<T> {
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         self.fit.profile_step()
     }
 
     fn work(&self) -> Result<Option<FitWork>> {
-        Ok(Some(FitWork { count: self.fit.count(), work: self.fit.work()? }))
-    }
-
-    fn as_any(&self) -> &dyn Any {
-        self
+        Ok(Some(FitWork { form: None, count: self.fit.count(), work: self.fit.work()? }))
     }
 }
 

@@ -12,56 +12,34 @@ use crate::fields::motion::{self, ViewMotion};
 use crate::fields::scale::dynamic_half;
 use crate::fields::state;
 use crate::fitting::extent::between_phases;
-use crate::fitting::fit::{Method, PlannedFit, SavedAt, SavedFit};
-use crate::gpu::device::Gpu;
-use crate::kernels::tuning::Tuning;
+use crate::fitting::fit::{Abilities, Method, PlannedFit};
 use crate::model::hull::Hull;
 use crate::model::scene::Scene;
 use crate::scan::dataset::Dataset;
-use crate::tensors::File;
 
 /// The method, for the registry.
-pub struct NertCa;
+pub static METHOD: Method = Method {
+    kind: MethodKind::NertCa,
+    checkpoint_format: state::FORMAT,
+    smaller_steps: "a lower static.lr or dynamic.lr, or a longer dynamic.delay",
+    boxes_hold_all_rays: false,
+    plan,
+    read: state::read,
+    make_pipelines: |_, _, _| Ok(()),
+    rays_per_iteration: |config| config.train.rays,
+    lower_rates: data::lower_rates,
+    abilities: Abilities::NONE,
+};
 
-impl Method for NertCa {
-    fn kind(&self) -> MethodKind {
-        MethodKind::NertCa
-    }
-
-    fn checkpoint_format(&self) -> &'static str {
-        state::FORMAT
-    }
-
-    fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
-        notes.extend(heart_shifts_ignored(dataset));
-        notes.extend(between_phases(dataset, "are trained at their own time"));
-        let motion = motion::analyse(dataset, &config.hull);
-        let hull = choose_hull(config, dataset, &motion, notes);
-        let scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
-        let lists = RayLists::of_hull(config, dataset, &motion, hull.as_ref());
-        let data = FieldData::new(config, dataset, &motion, hull, scene, lists)?;
-        Ok(PlannedFit { scene: data.scene.clone(), data: Box::new(data) })
-    }
-
-    fn read(&self, sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
-        state::read(sections, config, at, file)
-    }
-
-    fn rays_per_iteration(&self, config: &Config) -> u32 {
-        config.train.rays
-    }
-
-    fn lower_rates(&self, config: &mut Config, factor: f64) {
-        data::lower_rates(config, factor);
-    }
-
-    fn smaller_steps(&self) -> &'static str {
-        "a lower static.lr or dynamic.lr, or a longer dynamic.delay"
-    }
-
-    fn make_pipelines(&self, _: &Gpu, _: &Config, _: &Tuning) -> Result<()> {
-        Ok(())
-    }
+/// Prepares a fit.
+fn plan(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
+    notes.extend(heart_shifts_ignored(dataset));
+    notes.extend(between_phases(dataset, "are trained at their own time"));
+    let motion = motion::analyse(dataset, &config.hull);
+    let hull = choose_hull(config, dataset, &motion, notes);
+    let scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
+    let lists = RayLists::of_hull(config, dataset, &motion, hull.as_ref());
+    Ok(FieldData::new(config, dataset, &motion, hull, scene, lists)?.into())
 }
 
 fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes: &mut Vec<String>) -> Option<Hull> {

@@ -19,10 +19,8 @@ use crate::config::{Config, StaticData};
 use crate::error::{Error, Result};
 use crate::fields::scale::FieldVolume;
 use crate::fitting::extent::volume_half;
-use crate::fitting::fit::{Fit, FitData, FitField, FitStart, Method, PlannedFit, SavedAt, SavedFit};
+use crate::fitting::fit::{Abilities, Fit, FitData, FitField, FitStart, Method, PlannedFit, SavedAt, SavedFit, Use};
 use crate::fitting::sets::ignored;
-use crate::gpu::device::Gpu;
-use crate::kernels::tuning::Tuning;
 use crate::model::scene::Scene;
 use crate::scan::dataset::Dataset;
 use crate::tensors::File;
@@ -30,55 +28,41 @@ use data::SaxData;
 use field::{SaxField, SaxShape, SaxState};
 use interface::KEY;
 use stages::SaxKernels;
-use std::any::Any;
 use std::sync::Arc;
 use trainer::SaxTrainer;
 
 /// The method, for the registry.
-pub struct SaxNerf;
+pub static METHOD: Method = Method {
+    kind: MethodKind::SaxNerf,
+    checkpoint_format: "nertca-checkpoint-4",
+    smaller_steps: field::SMALLER_STEPS,
+    boxes_hold_all_rays: false,
+    plan,
+    read,
+    make_pipelines: |gpu, _, _| SaxKernels::new(gpu).map(|_| ()),
+    rays_per_iteration: |config| setup::n_rays(&config.sax),
+    lower_rates: |config, factor| config.sax.rate *= factor,
+    abilities: Abilities::NONE,
+};
 
-impl Method for SaxNerf {
-    fn kind(&self) -> MethodKind {
-        MethodKind::SaxNerf
-    }
+/// Prepares a fit.
+fn plan(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
+    let volume = FieldVolume {
+        half: volume_half(config.sax.half_extent_mm, dataset),
+        // Volumes are kept in units of the attenuation of a density of 1.
+        attenuation: Some(dataset.vessel_attenuation.filter(|_| config.sax.normalise).unwrap_or(1.0)),
+    };
+    let data = SaxData::new(dataset, &config.sax, volume.half)?;
+    notes.extend(notes_of(config, dataset, &data));
+    Ok(PlannedFit::of_images(Scene::of_volume(config, dataset, volume)?, data))
+}
 
-    fn checkpoint_format(&self) -> &'static str {
-        "nertca-checkpoint-4"
-    }
-
-    fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
-        let volume = FieldVolume {
-            half: volume_half(config.sax.half_extent_mm, dataset),
-            // Volumes are kept in units of the attenuation of a density of 1.
-            attenuation: Some(dataset.vessel_attenuation.filter(|_| config.sax.normalise).unwrap_or(1.0)),
-        };
-        let data = SaxData::new(dataset, &config.sax, volume.half)?;
-        notes.extend(notes_of(config, dataset, &data));
-        Ok(PlannedFit { scene: Scene::of_volume(config, dataset, volume)?, data: Box::new(data) })
-    }
-
-    fn read(&self, sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
-        let bad = |e: serde_json::Error| Error::data(file.path, KEY, e.to_string());
-        let about = serde_json::from_value(sections[KEY].clone()).map_err(bad)?;
-        let (field, state) = tensors::read(&about, SaxShape::of(&config.sax), file, at)?;
-        Ok(SavedFit { field: FitField::of_own(Arc::new(field)), state: Arc::new(state) })
-    }
-
-    fn rays_per_iteration(&self, config: &Config) -> u32 {
-        setup::n_rays(&config.sax)
-    }
-
-    fn lower_rates(&self, config: &mut Config, factor: f64) {
-        config.sax.rate *= factor;
-    }
-
-    fn smaller_steps(&self) -> &'static str {
-        field::SMALLER_STEPS
-    }
-
-    fn make_pipelines(&self, gpu: &Gpu, _: &Config, _: &Tuning) -> Result<()> {
-        SaxKernels::new(gpu).map(|_| ())
-    }
+/// Reads the field and the state of its fit from a checkpoint.
+fn read(sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
+    let bad = |e: serde_json::Error| Error::data(file.path, KEY, e.to_string());
+    let about = serde_json::from_value(sections[KEY].clone()).map_err(bad)?;
+    let (field, state) = tensors::read(&about, SaxShape::of(&config.sax), file, at)?;
+    Ok(SavedFit { field: FitField::of_own(Arc::new(field)), state: Arc::new(state) })
 }
 
 /// Returns notes for the user about decisions on the data.
@@ -107,23 +91,14 @@ fn notes_of(config: &Config, dataset: &Dataset, data: &SaxData) -> Vec<String> {
 }
 
 impl FitData for SaxData {
-    fn begin(&self, start: &FitStart<'_>, _: &mut Vec<String>) -> Result<Box<dyn Fit>> {
-        let FitStart { gpu, config, .. } = *start;
-        let own = |saved: &SavedFit| -> Option<(SaxField, SaxState)> {
-            let field = saved.field.own.as_ref()?.as_any().downcast_ref::<SaxField>()?;
-            Some((field.clone(), saved.state.as_any().downcast_ref::<SaxState>()?.clone()))
-        };
-        Ok(match start.from.resumed().and_then(own) {
-            Some((field, state)) => Box::new(SaxTrainer::with(gpu, self.clone(), config, &field, &state)?),
-            None => Box::new(SaxTrainer::new(gpu, self.clone(), config)?),
+    fn begin(self: Box<Self>, start: &FitStart<'_>, _: &mut Vec<String>) -> Result<Box<dyn Fit>> {
+        let FitStart { gpu, config, from, .. } = *start;
+        let field = from.field_to(Use::Resume).and_then(|field| field.own.as_ref()?.downcast::<SaxField>());
+        Ok(match field.zip(from.state_as::<SaxState>()) {
+            Some((field, state)) => Box::new(SaxTrainer::with(gpu, *self, config, field, state)?),
+            None => Box::new(SaxTrainer::new(gpu, *self, config)?),
         })
     }
 
-    fn as_any(&self) -> &dyn Any {
-        self
-    }
-
-    fn as_any_mut(&mut self) -> &mut dyn Any {
-        self
-    }
+    fn set_scene(&mut self, _: &Scene) {}
 }

@@ -16,7 +16,10 @@ use crate::config::{Config, StaticData};
 use crate::error::Result;
 use crate::fields::scale::FieldVolume;
 use crate::fitting::extent::volume_half;
-use crate::fitting::fit::{Fit, FitData, FitField, FitStart, FitState, Method, PlannedFit, SavedAt, SavedFit};
+use crate::fitting::fit::{
+    Abilities, Fit, FitData, FitField, FitStart, FitState, Method, PlannedFit, SavedAt, SavedFit, SavedState, Use,
+    data_as,
+};
 use crate::fitting::sets::ignored;
 use crate::fitting::shown::ShownFit;
 use crate::gaussians::blobs::BlobKernels;
@@ -30,63 +33,65 @@ use crate::kernels::tuning::Tuning;
 use crate::model::Model;
 use crate::model::scene::Scene;
 use crate::scan::dataset::Dataset;
-use crate::tensors::{File, FileTensor};
+use crate::tensors::File;
 use data::XData;
 use stages::XKernels;
 use state::XState;
-use std::any::Any;
 use std::sync::Arc;
 use trainer::XTrainer;
 
 /// The method, for the registry.
-pub struct XGaussian;
+pub static METHOD: Method = Method {
+    kind: MethodKind::XGaussian,
+    checkpoint_format: crate::gaussians::tensors::FORMAT,
+    smaller_steps: state::SMALLER_STEPS,
+    boxes_hold_all_rays: false,
+    plan,
+    read,
+    make_pipelines,
+    rays_per_iteration: |_| 0,
+    lower_rates,
+    abilities: Abilities {
+        time_gaussians: Some(|data, start| {
+            let fit = begin(data_as::<XData>(data)?.clone(), start, &mut Vec::new())?;
+            Ok(Box::new(fit))
+        }),
+        ..Abilities::NONE
+    },
+};
 
-impl Method for XGaussian {
-    fn kind(&self) -> MethodKind {
-        MethodKind::XGaussian
-    }
+/// Prepares a fit.
+fn plan(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
+    let volume = FieldVolume { half: volume_half(config.x.half_extent_mm, dataset), attenuation: None };
+    let data = data_of(config, dataset, notes)?;
+    Ok(PlannedFit::of_images(Scene::of_volume(config, dataset, volume)?, data))
+}
 
-    fn checkpoint_format(&self) -> &'static str {
-        crate::gaussians::tensors::FORMAT
-    }
+/// Reads the field and the state of its fit from a checkpoint.
+fn read(sections: &serde_json::Value, _: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
+    let gaussians = crate::gaussians::tensors::read_section(sections, file, at.n_phases)?;
+    let state = tensors::read(file, at.n_phases)?;
+    Ok(SavedFit { field: FitField::of_gaussians(gaussians), state: Arc::new(state) })
+}
 
-    fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
-        let volume = FieldVolume { half: volume_half(config.x.half_extent_mm, dataset), attenuation: None };
-        let data = Box::new(data_of(config, dataset, notes)?);
-        Ok(PlannedFit { scene: Scene::of_volume(config, dataset, volume)?, data })
-    }
+/// Lowers the learning rates by a factor.
+fn lower_rates(config: &mut Config, factor: f64) {
+    config.x.position_rate *= factor;
+    config.x.position_rate_end *= factor;
+    config.x.intensity_rate *= factor;
+    config.x.opacity_rate *= factor;
+    config.x.scale_rate *= factor;
+    config.x.rotation_rate *= factor;
+}
 
-    fn read(&self, sections: &serde_json::Value, _: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
-        let gaussians = crate::gaussians::tensors::read_section(sections, file, at.n_phases)?;
-        let state = tensors::read(file, at.n_phases)?;
-        Ok(SavedFit { field: FitField::of_gaussians(gaussians), state: Arc::new(state) })
-    }
-
-    fn rays_per_iteration(&self, _: &Config) -> u32 {
-        0
-    }
-
-    fn lower_rates(&self, config: &mut Config, factor: f64) {
-        config.x.position_rate *= factor;
-        config.x.position_rate_end *= factor;
-        config.x.intensity_rate *= factor;
-        config.x.opacity_rate *= factor;
-        config.x.scale_rate *= factor;
-        config.x.rotation_rate *= factor;
-    }
-
-    fn smaller_steps(&self) -> &'static str {
-        state::SMALLER_STEPS
-    }
-
-    fn make_pipelines(&self, gpu: &Gpu, _: &Config, tuning: &Tuning) -> Result<()> {
-        XKernels::new(gpu)?;
-        // These fits also use the stages that draw pictures.
-        Build::default().stage::<push::GaussianProject>(gpu)?;
-        SplatStage::<push::GaussianSplat>::new(gpu)?;
-        BlobKernels::new(gpu, tuning)?;
-        into_buffers(gpu).map(|_| ())
-    }
+/// Builds the pipelines of fits.
+fn make_pipelines(gpu: &Gpu, _: &Config, tuning: &Tuning) -> Result<()> {
+    XKernels::new(gpu)?;
+    // These fits also use the stages that draw pictures.
+    Build::default().stage::<push::GaussianProject>(gpu)?;
+    SplatStage::<push::GaussianSplat>::new(gpu)?;
+    BlobKernels::new(gpu, tuning)?;
+    into_buffers(gpu).map(|_| ())
 }
 
 /// Prepares X-Gaussian's data, and notes about them for the user.
@@ -116,39 +121,31 @@ fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
     Ok(data)
 }
 
+/// Begins a fit, or goes on where a saved one has ended.
+fn begin(data: XData, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<ShownFit<XTrainer>> {
+    let FitStart { gpu, config, from, .. } = *start;
+    let step = from.field_to(Use::Resume).and_then(|field| Some(field.gaussians.as_ref()?.rows().step));
+    let trainer = match from.state_as::<XState>().zip(step) {
+        Some((state, step)) => XTrainer::with(gpu, data, config, state, step)?,
+        None => {
+            let (trainer, more) = XTrainer::new(gpu, data, config)?;
+            notes.extend(more);
+            trainer
+        }
+    };
+    ShownFit::new(trainer)
+}
+
 impl FitData for XData {
-    fn begin(&self, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<Box<dyn Fit>> {
-        let FitStart { gpu, config, .. } = *start;
-        let own = |saved: &SavedFit| -> Option<(XState, u32)> {
-            let field = saved.field.gaussians.as_ref()?;
-            Some((saved.state.as_any().downcast_ref::<XState>()?.clone(), field.rows().step))
-        };
-        let trainer = match start.from.resumed().and_then(own) {
-            Some((state, step)) => XTrainer::with(gpu, self.clone(), config, &state, step)?,
-            None => {
-                let (trainer, more) = XTrainer::new(gpu, self.clone(), config)?;
-                notes.extend(more);
-                trainer
-            }
-        };
-        Ok(Box::new(ShownFit::new(trainer)?))
+    fn begin(self: Box<Self>, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<Box<dyn Fit>> {
+        Ok(Box::new(begin(*self, start, notes)?))
     }
 
-    fn as_any(&self) -> &dyn Any {
-        self
-    }
-
-    fn as_any_mut(&mut self) -> &mut dyn Any {
-        self
-    }
+    fn set_scene(&mut self, _: &Scene) {}
 }
 
 impl FitState for XState {
-    fn tensors(&self, _: &Model) -> Result<Vec<FileTensor>> {
-        Ok(tensors::tensors(self))
-    }
-
-    fn as_any(&self) -> &dyn Any {
-        self
+    fn saved(&self, _: &Model) -> Result<SavedState> {
+        Ok(SavedState::of_tensors(tensors::tensors(self)))
     }
 }

@@ -8,7 +8,7 @@ use std::any::Any;
 use std::fmt::Debug;
 
 /// The field of a method that uses neither the tensor field nor the network nor the Gaussians of other methods.
-pub trait Field: Debug + Send + Sync {
+pub trait Field: Any + Debug + Send + Sync {
     /// Returns the key of the method, under which headers of checkpoints and `info` have this field.
     fn key(&self) -> &'static str;
 
@@ -29,9 +29,14 @@ pub trait Field: Debug + Send + Sync {
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`]; other device errors.
     fn drawing(&self, gpu: &Gpu) -> Result<Box<dyn FieldDrawing>>;
+}
 
-    /// Returns the field as its own type, for its method.
-    fn as_any(&self) -> &dyn Any;
+impl dyn Field {
+    /// Returns the field as the type of its method.
+    pub fn downcast<T: Field>(&self) -> Option<&T> {
+        let field: &dyn Any = self;
+        field.downcast_ref()
+    }
 }
 
 /// Cells of a volume along rays of its rows.

@@ -9,7 +9,7 @@ use crate::model::Model;
 pub struct Snapshot {
     /// The model without its field.
     pub(super) model: Model,
-    pub(super) fit: Box<dyn PendingFit>,
+    pub(super) fit: PendingFit,
     pub(super) data_fingerprint: String,
 }
 
@@ -24,7 +24,7 @@ impl Snapshot {
     /// # Errors
     /// [`crate::error::Error::Diverged`] when a parameter is not finite; device errors.
     pub fn wait(self) -> Result<Checkpoint> {
-        let SavedFit { field: FitField { params, hull, gaussians, own }, state } = self.fit.wait()?;
+        let SavedFit { field: FitField { params, hull, gaussians, own }, state } = (self.fit)()?;
         let model = Model { params, hull, gaussians, field: own, ..self.model };
         Ok(Checkpoint { model, fit: state, data_fingerprint: self.data_fingerprint })
     }

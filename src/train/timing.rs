@@ -3,7 +3,7 @@
 use crate::choice::Choice;
 use crate::config::Config;
 use crate::error::{Error, Result};
-use crate::fitting::fit::{Beginning, FitData, FitStart, TimedFit};
+use crate::fitting::fit::{FitData, FitStart, Measured, Start};
 use crate::fitting::ledger::Ledger;
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::device::Gpu;
@@ -184,10 +184,10 @@ impl Subject {
         let max = MAX_ITERATIONS.min(u32::MAX / config.train.rays);
         config.train.iterations = max;
         let method = methods::of(&config);
-        method.lower_rates(&mut config, SLOWLY);
+        (method.lower_rates)(&mut config, SLOWLY);
         config.dynamic.delay = if with_network { 0 } else { config.train.iterations };
         let plan = Plan::new(&config, dataset)?;
-        let (cost, n_rays) = (NetworkCost::of(&plan.params), method.rays_per_iteration(&config));
+        let (cost, n_rays) = (NetworkCost::of(&plan.params), (method.rays_per_iteration)(&config));
         let trainer = Trainer::new(gpu, plan, dataset, tuning.clone())?;
         let mut subject = Subject { gpu: gpu.clone(), trainer, cost, n_rays, max };
         subject.run(config.gaussian_iterations() + WARM_UP)?;
@@ -205,8 +205,8 @@ impl Subject {
     }
 
     /// Barriers of an iteration; none where a Lineformer is all there is.
-    pub fn barriers(&self) -> Option<u32> {
-        self.trainer.barriers()
+    pub fn barriers(&mut self) -> Option<u32> {
+        self.trainer.measured()?.barriers()
     }
 
     /// Operations of the network per sample.
@@ -215,8 +215,8 @@ impl Subject {
     }
 
     /// Minimum work of an iteration's stages with `live_samples` live samples.
-    pub fn work(&self, live_samples: u64) -> Ledger {
-        self.trainer.work(live_samples)
+    pub fn work(&mut self, live_samples: u64) -> Ledger {
+        self.trainer.measured().map_or_else(Ledger::new, |fit| fit.ledger(live_samples))
     }
 
     /// Runs `n` iterations; returns the live samples of all of them.
@@ -297,7 +297,7 @@ const MIN_FITS: usize = 3;
 
 /// A fit that was timed.
 struct TimedGaussians {
-    fit: Box<dyn TimedFit>,
+    fit: Box<dyn Measured>,
     preparation_s: f64,
     /// Milliseconds per iteration.
     ms: f64,
@@ -333,10 +333,13 @@ impl GaussianSubject {
         Ok(GaussianSubject { gpu: gpu.clone(), data, config, timed, notes: plan.notes })
     }
 
-    fn begin(&self) -> Result<Box<dyn TimedFit>> {
+    fn begin(&self) -> Result<Box<dyn Measured>> {
         let tuning = Tuning::for_device(self.gpu.info());
         let (gpu, config) = (&self.gpu, &self.config);
-        self.data.begin_timed(&FitStart { gpu, config, tuning: &tuning, from: Beginning::Scratch })
+        match methods::of(config).abilities.time_gaussians {
+            Some(begin) => begin(&*self.data, &FitStart { gpu, config, tuning: &tuning, from: Start::default() }),
+            None => Err(without_gaussians(config)),
+        }
     }
 
     /// Choices about data and settings.
@@ -347,7 +350,7 @@ impl GaussianSubject {
     fn fit(&self) -> Result<TimedGaussians> {
         let begin = Instant::now();
         let mut fit = self.begin()?;
-        while !fit.is_prepared() {
+        while fit.progress().preparation.is_some() {
             fit.advance(0)?;
         }
         let preparation_s = begin.elapsed().as_secs_f64();
@@ -382,9 +385,9 @@ impl GaussianSubject {
             preparation_s.push(last.preparation_s);
         }
         let (host_cpu_share, readings) = meanwhile.end();
-        let work = last.fit.work()?;
+        let work = last.fit.work()?.ok_or_else(|| without_gaussians(&self.config))?;
         let timing = GaussianTiming {
-            form: last.fit.form().unwrap_or_else(|| self.config.gaussians.form.name()).into(),
+            form: work.form.unwrap_or_else(|| self.config.gaussians.form.name()).into(),
             count: work.count,
             preparation_s: median(&preparation_s),
             ms,
@@ -401,10 +404,14 @@ impl GaussianSubject {
     }
 }
 
+fn without_gaussians(config: &Config) -> Error {
+    Error::config("gaussians.form", config.gaussians.form.name(), "this configuration has no Gaussians to time")
+}
+
 /// Runs a fit up to an iteration.
-fn run_fit(fit: &mut dyn TimedFit, until: u32) -> Result<()> {
-    while fit.step() < until {
-        if fit.advance(until)? == 0 {
+fn run_fit(fit: &mut dyn Measured, until: u32) -> Result<()> {
+    while fit.progress().step < until {
+        if fit.advance(until)?.losses.is_empty() {
             return Err(Error::Internal("the timed fit is over".into()));
         }
     }

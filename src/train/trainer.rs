@@ -4,10 +4,8 @@ use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::fields::trainer::FieldsFit;
 use crate::fingerprint::Fingerprint;
-use crate::fitting::fit::{Beginning, FieldFeed, Fit, FitField, FitStart, PreparedGaussians};
-use crate::fitting::ledger::Ledger;
+use crate::fitting::fit::{Advance, FieldFeed, Fit, FitField, FitStart, Measured, Start, Use};
 use crate::fitting::losses::{LargeLoss, LossWatch, StepLoss};
-use crate::gaussians::field::DynamicGaussians;
 use crate::geometry::CArm;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
@@ -26,6 +24,8 @@ pub struct Trainer {
     fit: Box<dyn Fit>,
     watch: LossWatch,
     large_loss: Option<LargeLoss>,
+    /// Findings about the data that were not taken yet.
+    findings: Vec<String>,
     vessel_attenuation: Option<f64>,
     c_arm: CArm,
     image_size: [usize; 2],
@@ -76,36 +76,7 @@ impl Trainer {
     /// [`Error::Config`] when `tuning` asks for what the device lacks; device errors, [`Error::OutOfMemory`] first of
     /// all.
     pub fn new(gpu: &Gpu, plan: Plan, dataset: &Dataset, tuning: Tuning) -> Result<Trainer> {
-        Self::start(gpu, plan, dataset, tuning, Beginning::Scratch)
-    }
-
-    /// Starts a run from scratch, with Gaussians that were fitted before, for example while its views were adjusted.
-    ///
-    /// # Errors
-    /// Errors of [`Trainer::new`].
-    pub fn prepared(
-        gpu: &Gpu,
-        plan: Plan,
-        dataset: &Dataset,
-        tuning: Tuning,
-        gaussians: PreparedGaussians<'_>,
-    ) -> Result<Trainer> {
-        Self::start(gpu, plan, dataset, tuning, Beginning::Prepared(gaussians))
-    }
-
-    /// Starts a run from scratch but for its Gaussians, which go on from those that were fitted to `earlier` data as in
-    /// [`Trainer::carry_on`].
-    ///
-    /// # Errors
-    /// Errors of [`Trainer::new`].
-    pub fn start_over(
-        gpu: &Gpu,
-        plan: Plan,
-        dataset: &Dataset,
-        tuning: Tuning,
-        earlier: Option<&DynamicGaussians>,
-    ) -> Result<Trainer> {
-        Self::start(gpu, plan, dataset, tuning, earlier.map_or(Beginning::Scratch, Beginning::AfterGaussians))
+        Self::begin(gpu, plan, dataset, tuning, Start::default())
     }
 
     /// Continues a run: the result is the same as without interruption.
@@ -127,7 +98,7 @@ impl Trainer {
             ));
         }
         check_shape(&plan, checkpoint)?;
-        Self::start(gpu, plan, dataset, tuning, Beginning::Resumed(&checkpoint.saved_fit()))
+        Self::begin(gpu, plan, dataset, tuning, Start::of(&checkpoint.saved_fit(), Use::Resume))
     }
 
     /// Continues a run on other images than it was begun on, for example when more of them arrived. Gaussians go on from those
@@ -145,19 +116,24 @@ impl Trainer {
         check_shape(&plan, checkpoint)?;
         let saved = checkpoint.saved_fit();
         let is_same = checkpoint.data_fingerprint == data_fingerprint(dataset);
-        let from = if is_same { Beginning::Resumed(&saved) } else { Beginning::CarriedOn(&saved) };
-        Self::start(gpu, plan, dataset, tuning, from)
+        let used = if is_same { Use::Resume } else { Use::GoOn };
+        Self::begin(gpu, plan, dataset, tuning, Start::of(&saved, used))
     }
 
-    fn start(gpu: &Gpu, mut plan: Plan, dataset: &Dataset, tuning: Tuning, from: Beginning<'_>) -> Result<Trainer> {
+    /// Starts a run with results of earlier fits.
+    ///
+    /// # Errors
+    /// Errors of [`Trainer::new`].
+    pub fn begin(gpu: &Gpu, mut plan: Plan, dataset: &Dataset, tuning: Tuning, from: Start<'_>) -> Result<Trainer> {
         let tuning = tuning.for_network(plan.config.method().has_network());
         let mut config = plan.config.clone();
         config.train.iterations_per_submit = tuning.iterations_per_submit.unwrap_or(config.train.iterations_per_submit);
         let data = plan.data.take().ok_or_else(|| Error::Internal("a fit has begun with these data".into()))?;
-        let fit = data.begin_only(&FitStart { gpu, config: &config, tuning: &tuning, from }, &mut plan.notes)?;
+        let fit = data.begin(&FitStart { gpu, config: &config, tuning: &tuning, from }, &mut plan.notes)?;
         Ok(Trainer {
-            watch: LossWatch::new(&plan.config, methods::of(&plan.config).smaller_steps()),
+            watch: LossWatch::new(&plan.config, methods::of(&plan.config).smaller_steps),
             large_loss: None,
+            findings: Vec::new(),
             // A blended picture is no sum of attenuations.
             vessel_attenuation: dataset.vessel_attenuation.filter(|_| !plan.config.method().is_blended()),
             c_arm: dataset.reference_c_arm(),
@@ -171,12 +147,12 @@ impl Trainer {
 
     /// Returns the number of iterations done.
     pub fn step(&self) -> u32 {
-        self.fit.step()
+        self.fit.progress().step
     }
 
     /// Returns the number of iterations handed to the device.
     pub fn submitted(&self) -> u32 {
-        self.fit.submitted()
+        self.fit.progress().submitted
     }
 
     /// Returns the plan that the run was prepared from, without its data.
@@ -186,7 +162,7 @@ impl Trainer {
 
     /// Returns the choices made for the device.
     pub fn tuning(&self) -> &Tuning {
-        self.fit.tuning().unwrap_or(&self.tuning)
+        &self.tuning
     }
 
     /// Returns the fit as the type of its method, for tests and measurements.
@@ -195,7 +171,8 @@ impl Trainer {
     /// [`Error::Internal`] for a fit of another method.
     pub fn fit<T: Any>(&self) -> Result<&T> {
         let other = || Error::Internal("the fit is that of another method".into());
-        self.fit.as_any().downcast_ref().ok_or_else(other)
+        let fit: &dyn Any = &*self.fit;
+        fit.downcast_ref().ok_or_else(other)
     }
 
     /// Returns the fit of fields that rays are marched through, for tests and measurements.
@@ -206,14 +183,9 @@ impl Trainer {
         self.fit()
     }
 
-    /// Returns the number of barriers of an iteration, where it is known.
-    pub fn barriers(&self) -> Option<u32> {
-        self.fit.barriers()
-    }
-
-    /// Returns the minimum work of an iteration's stages with `live_samples` live samples; empty where it is not known.
-    pub fn work(&self, live_samples: u64) -> Ledger {
-        self.fit.ledger(live_samples)
+    /// Returns the fit for measurements, where its method has any.
+    pub fn measured(&mut self) -> Option<&mut dyn Measured> {
+        self.fit.measured()
     }
 
     /// Keeps the device busy towards `until` and returns the losses that became known. Returns with work
@@ -223,9 +195,10 @@ impl Trainer {
     /// # Errors
     /// [`Error::Diverged`] on a loss that is not finite, or at which the configuration ends a run; device errors.
     pub fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
-        let losses = self.fit.advance(until)?;
+        let Advance { losses, smaller_steps, findings } = self.fit.advance(until)?;
+        self.findings.extend(findings);
         losses.iter().try_for_each(|loss| self.watch_loss(loss))?;
-        if let Some(smaller_steps) = self.fit.new_objective() {
+        if let Some(smaller_steps) = smaller_steps {
             self.watch = LossWatch::new(&self.plan.config, smaller_steps);
         }
         Ok(losses)
@@ -233,12 +206,12 @@ impl Trainer {
 
     /// Returns the share done of the preparation before the first iteration; none when that has begun.
     pub fn preparation(&self) -> Option<f64> {
-        self.fit.preparation()
+        self.fit.progress().preparation
     }
 
     /// Tells whether the field of earlier data is shown, until the fit has a better one.
     pub fn shows_earlier(&self) -> bool {
-        self.fit.shows_earlier()
+        self.fit.progress().shows_earlier
     }
 
     /// Returns the numbers of the field, for those who draw it.
@@ -261,15 +234,15 @@ impl Trainer {
 
     /// Returns findings about the data since the last call, for the user.
     pub fn take_findings(&mut self) -> Vec<String> {
-        self.fit.take_findings()
+        std::mem::take(&mut self.findings)
     }
 
-    /// Runs one iteration with a timestamp around each pass.
+    /// Runs one iteration with a timestamp around each pass; none where the method is not measured.
     ///
     /// # Errors
     /// Device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        self.fit.profile_step()
+        self.fit.measured().map_or(Ok(Vec::new()), |fit| fit.profile_step())
     }
 
     /// Returns the model without its parameters, which are on the device, for a renderer that follows the run.
@@ -320,7 +293,7 @@ impl Trainer {
     /// # Errors
     /// Errors of [`Snapshot::wait`].
     pub fn checkpoint(&mut self) -> Result<Checkpoint> {
-        while self.fit.step() < self.fit.submitted() {
+        while self.step() < self.submitted() {
             self.advance(self.submitted())?;
         }
         self.snapshot()?.wait()

@@ -107,7 +107,7 @@ fn an_iteration_waits_where_it_must() {
         [("fast-mlp", true), ("fast-mlp", false), ("public-code", false), ("nerf-ca", true)].map(|(preset, again)| {
             let tuning = Tuning { matrices: MatrixTuning { recompute: again, ..MatrixTuning::CPU }, ..tuning.clone() };
             let plan = Plan::new(&small_config(preset, &[]), &dataset).unwrap();
-            Trainer::new(&gpu, plan, &dataset, tuning).unwrap().barriers().unwrap()
+            Trainer::new(&gpu, plan, &dataset, tuning).unwrap().measured().unwrap().barriers().unwrap()
         });
     assert_eq!(barriers, [12, 12, 16, 17]);
     expect_silence(gpu);

@@ -8,7 +8,7 @@ use nertca_vk::calibrate::pose::Poses;
 use nertca_vk::calibrate::{adjusted, calibrate};
 use nertca_vk::config::{AdjustMode, Config, Preset};
 use nertca_vk::fields::scale::dynamic_half;
-use nertca_vk::fitting::fit::{AdjustTask, MadeGaussians, PreparedGaussians};
+use nertca_vk::fitting::fit::{AdjustTask, FitField, MadeFit, Start, Use};
 use nertca_vk::gaussians::field::DeformableGaussians;
 use nertca_vk::gaussians::view::SplatView;
 use nertca_vk::geometry::MM_PER_UNIT;
@@ -18,6 +18,7 @@ use nertca_vk::methods::dynamic_gaussians::adjust::poses::Stands;
 use nertca_vk::methods::dynamic_gaussians::adjust::residual::misfit;
 use nertca_vk::methods::dynamic_gaussians::adjust::step::FieldInLoop;
 use nertca_vk::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use nertca_vk::methods::dynamic_gaussians::made::MadeGaussians;
 use nertca_vk::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use nertca_vk::methods::dynamic_gaussians::targets::Targets;
 use nertca_vk::plan::Plan;
@@ -179,24 +180,24 @@ fn error_px(shot: &Shot, dataset: &Dataset) -> f64 {
 }
 
 /// Adjusts the views of a shot, starting from a calibration, and returns the calibration and the fit that the run takes over.
-fn adjust(gpu: &Gpu, shot: &Shot, calibration: &Calibration) -> (Calibration, MadeGaussians) {
+fn adjust(gpu: &Gpu, shot: &Shot, calibration: &Calibration) -> (Calibration, MadeFit) {
     let config = fast();
     let task = AdjustTask { gpu, config: &config, dataset: &shot.dataset, calibration };
-    let outcome = methods::of(&config).adjust(&task, &mut |_| Ok(())).unwrap().unwrap();
+    let outcome = methods::of(&config).abilities.adjust_views.unwrap()(&task, &mut |_| Ok(())).unwrap().unwrap();
     let after = adjusted(&shot.dataset, calibration.clone(), outcome.adjusted).unwrap();
     println!("{}", after.notes.join("; "));
     (after, outcome.made.unwrap())
 }
 
-fn made_before(made: &MadeGaussians) -> PreparedGaussians<'_> {
-    PreparedGaussians { made: Some(made), shown: None }
+fn made_before(made: &MadeFit) -> Start<'_> {
+    Start { made: Some(made), ..Start::default() }
 }
 
 /// Trains to the end of the Gaussians with and without the fit that an adjustment has left, and checks that the results are the same.
-fn expect_taken_over(gpu: &Gpu, dataset: &Dataset, made: &MadeGaussians) {
+fn expect_taken_over(gpu: &Gpu, dataset: &Dataset, made: &MadeFit) {
     let config = fast();
     let plan = || Plan::new(&config, dataset).unwrap();
-    let mut with = Trainer::prepared(gpu, plan(), dataset, tuning(gpu), made_before(made)).unwrap();
+    let mut with = Trainer::begin(gpu, plan(), dataset, tuning(gpu), made_before(made)).unwrap();
     let mut without = Trainer::new(gpu, plan(), dataset, tuning(gpu)).unwrap();
     let end = config.gaussians.iterations;
     assert!(without.preparation().is_some(), "a fit from scratch prepares its Gaussians");
@@ -237,9 +238,10 @@ fn views_that_agree_are_not_adjusted() {
     assert!(before.frames.iter().zip(&after.frames).all(|(a, b)| a.contrast == b.contrast));
     assert_eq!(error_px(&shot, &before), error_px(&shot, &after));
     expect_taken_over(&gpu, &after, &made);
-    let other = MadeGaussians { fingerprint: "of other data".into(), ..made };
+    let made: &MadeGaussians = made.downcast_ref().unwrap();
+    let other: MadeFit = Arc::new(MadeGaussians { fingerprint: "of other data".into(), ..made.clone() });
     let plan = Plan::new(&fast(), &after).unwrap();
-    let trainer = Trainer::prepared(&gpu, plan, &after, tuning(&gpu), made_before(&other)).unwrap();
+    let trainer = Trainer::begin(&gpu, plan, &after, tuning(&gpu), made_before(&other)).unwrap();
     assert!(trainer.preparation().is_some(), "the fit to other data is not taken over");
 }
 
@@ -393,9 +395,10 @@ fn an_earlier_field_is_shown_until_the_first_of_several_fits_is_done() {
     run(&mut first, config.gaussians.iterations);
     let earlier = first.model().unwrap().gaussians.unwrap();
     drop(first);
-    let gaussians = PreparedGaussians { made: None, shown: Some(&earlier) };
+    let kept = FitField::of_gaussians(earlier.clone());
+    let from = Start { field: Some((&kept, Use::Show)), ..Start::default() };
     let plan = Plan::new(&config, dataset).unwrap();
-    let mut trainer = Trainer::prepared(&gpu, plan, dataset, tuning(&gpu), gaussians).unwrap();
+    let mut trainer = Trainer::begin(&gpu, plan, dataset, tuning(&gpu), from).unwrap();
     let shown = |trainer: &Trainer| trainer.feed().gaussians.unwrap().lock().unwrap().1.clone();
     let mut shares = Vec::new();
     while trainer.shows_earlier() {

@@ -49,7 +49,7 @@ fn an_iteration_waits_where_it_must() {
     let dataset = small_dataset(13, 11);
     let barriers = ["fast-mlp", "public-code", "nerf-ca"].map(|preset| {
         let plan = Plan::new(&small_config(preset, &[]), &dataset).unwrap();
-        Trainer::new(&gpu, plan, &dataset, tuning.clone()).unwrap().barriers().unwrap()
+        Trainer::new(&gpu, plan, &dataset, tuning.clone()).unwrap().measured().unwrap().barriers().unwrap()
     });
     assert_eq!(barriers, [21, 25, 36]);
     expect_silence(gpu);

@@ -4,6 +4,7 @@
 use crate::common::{expect_silence, gpu, tuning};
 use nertca_vk::checkpoint::Checkpoint;
 use nertca_vk::config::{Config, GaussianForm, Preset};
+use nertca_vk::fitting::fit::{FitField, Start, Use};
 use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::gpu::device::Gpu;
@@ -164,7 +165,9 @@ fn what_was_there_is_shown_until_there_is_better() {
         field(&three_views)
     };
     let plan = Plan::new(&Config::preset(Preset::Fast), &dataset).unwrap();
-    let mut trainer = Trainer::start_over(&gpu, plan, &dataset, tuning(&gpu), Some(&earlier)).unwrap();
+    let shown = FitField::of_gaussians(earlier.clone());
+    let from = Start { field: Some((&shown, Use::GoOn)), ..Start::default() };
+    let mut trainer = Trainer::begin(&gpu, plan, &dataset, tuning(&gpu), from).unwrap();
     let feed = trainer.feed().gaussians.unwrap();
     let shown = || feed.lock().unwrap().1.clone();
     let (mut with_earlier, mut with_sets) = (0, 0);

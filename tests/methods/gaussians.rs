@@ -13,7 +13,7 @@ use nertca_vk::gaussians::particles::Particles;
 use nertca_vk::gaussians::view::SplatView;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::{Gaussian, GaussianSetup};
-use nertca_vk::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use nertca_vk::methods::dynamic_gaussians::deformable::{DeformableTrainer, Earlier};
 use nertca_vk::methods::dynamic_gaussians::per_phase::GaussianTrainer;
 use nertca_vk::methods::dynamic_gaussians::setup;
 use nertca_vk::methods::dynamic_gaussians::shared_images::SharedImages;
@@ -364,7 +364,8 @@ fn a_reseeded_fit_moves_as_the_earlier_one_and_has_gaussians_of_its_own() {
     fitted(&mut first);
     let earlier = first.deformable().unwrap();
     let other = Config { seed: config.seed + 1, ..config.clone() };
-    let mut second = DeformableTrainer::reseeded(&gpu, targets_of(&dataset), &other, &earlier).unwrap();
+    let from = Earlier { field: &earlier, step: 0, reseeds: true };
+    let mut second = DeformableTrainer::after(&gpu, targets_of(&dataset), &other, from).unwrap();
     let seeded = second.deformable().unwrap();
     assert_eq!((second.step(), seeded.rest.rows.len()), (0, config.gaussians.count as usize));
     let n_basis = seeded.setup.n_basis as usize;

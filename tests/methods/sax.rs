@@ -267,7 +267,7 @@ fn a_batch_is_windows_and_pixels_outside_of_them_that_show_something() {
 
 /// Field of a model, as SAX-NeRF's own type.
 fn field_of(model: &Model) -> SaxField {
-    model.field.as_ref().unwrap().as_any().downcast_ref::<SaxField>().unwrap().clone()
+    model.field.as_ref().unwrap().downcast::<SaxField>().unwrap().clone()
 }
 
 /// State of a fit in a checkpoint, as SAX-NeRF's own type.

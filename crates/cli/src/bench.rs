@@ -134,7 +134,8 @@ fn write_json(file: &Path, value: &impl serde::Serialize) -> Result<()> {
 /// Performs a dry run, and prints a line about the events it covered.
 fn dry_run_of(global: &GlobalOptions, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<DryRun> {
     let max_buffer = u64::from(gpu.info().max_storage_buffer_range);
-    if let Some(memory) = methods::of(config).memory(config, dataset, max_buffer) {
+    let estimate = methods::of(config).abilities.estimate_memory;
+    if let Some(memory) = estimate.and_then(|estimate| estimate(config, dataset, max_buffer)) {
         let mib = |bytes: u64| bytes >> 20;
         out!(
             "memory of the whole run: about {} MiB of the host and {} MiB of the device, or {} MiB where they share it",
@@ -315,7 +316,7 @@ fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset,
             + after.median() * f64::from(config.train.iterations - delay));
     Ok(Timings {
         paths: subject.notes(),
-        rays: methods::of(config).rays_per_iteration(config),
+        rays: (methods::of(config).rays_per_iteration)(config),
         network_cost: config.method().has_network().then(|| subject.cost()),
         work: if config.method().has_network() { subject.work(after.live_samples) } else { Ledger::new() },
         gaussians: None,

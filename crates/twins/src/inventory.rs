@@ -112,7 +112,7 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
     for samples in [config.march.static_samples, config.march.render_samples] {
         Kernels::new(gpu, tuning.clone(), params.line_len() as u32, samples)?;
     }
-    methods::of(config).make_pipelines(gpu, config, &tuning)?;
+    (methods::of(config).make_pipelines)(gpu, config, &tuning)?;
     let mut all: Vec<Compiled> = gpu.pipeline_statistics().iter().map(Compiled::of).collect();
     if all.is_empty() {
         return Err(Error::Internal("the device was not opened with pipeline statistics".into()));

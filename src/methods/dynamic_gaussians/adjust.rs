@@ -8,17 +8,18 @@ pub mod step;
 use crate::calibrate::adjustment::{Adjusted, Adjustment};
 use crate::calibrate::observed::coarsened_for_calibration;
 use crate::calibrate::pose::{Poses, ViewPose};
+use crate::config::sections::Gaussians;
 use crate::config::{AdjustMode, CalibrateMode, Config, GaussianForm};
 use crate::error::{Error, Result};
 use crate::evidence::ratios::ViewEvidence;
 use crate::evidence::series::Series;
 use crate::fields::scale::dynamic_half;
-use crate::fitting::fit::{AdjustTask, AdjustedFit, MadeGaussians, Observe};
+use crate::fitting::fit::{AdjustTask, AdjustedFit, MadeFit, Observe};
 use crate::gaussians::field::{DeformableGaussians, DynamicGaussians};
 use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::data::SOFT_HULL_CELLS;
-use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
-use crate::methods::dynamic_gaussians::made::fingerprint;
+use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Earlier};
+use crate::methods::dynamic_gaussians::made::{MadeGaussians, fingerprint};
 use crate::methods::dynamic_gaussians::setup::carried_step;
 use crate::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use crate::methods::dynamic_gaussians::targets::Targets;
@@ -26,6 +27,7 @@ use crate::scan::dataset::Dataset;
 use poses::Stands;
 use rayon::prelude::*;
 use residual::misfit;
+use std::sync::Arc;
 use step::FieldInLoop;
 
 /// Gauss-Newton steps per fit, all with the derivatives at the first poses: new derivatives for each step gave no better poses.
@@ -93,17 +95,15 @@ pub(super) fn adjust(task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result
     Adjuster { gpu, config, stands, motion, is_full_size }.run(&calibrated, start, observe)
 }
 
-/// Start of a fit.
+/// Start and length of a fit.
 #[derive(Clone, Copy)]
-enum Start<'a> {
-    /// Seeds, all iterations, and pruning, as in the run.
-    Run,
-    /// Seeds, a few iterations. Nothing is pruned here and in the next kinds, because wrong poses take the support from ends of vessels.
-    Seeds,
-    /// Seeds that move as the field of the stage before; a few iterations.
-    Reseeded(&'a DeformableGaussians),
-    /// The field of the fit before, at slightly different poses; a few iterations.
-    Earlier(&'a DeformableGaussians),
+struct Start<'a> {
+    /// Field of an earlier fit, at slightly different poses; none for a fit that begins with seeds.
+    earlier: Option<Earlier<'a>>,
+    /// Iteration at which the fit ends.
+    end: u32,
+    /// Whether short components that the images do not support are dropped, as in a run. Wrong poses take the support from ends of vessels.
+    prunes: bool,
 }
 
 /// A fit after all iterations.
@@ -138,7 +138,7 @@ impl Adjuster<'_> {
         let outcome = |poses: Poses, accepted: bool, after: Option<f64>, made: MadeGaussians| {
             let record = Adjustment { accepted, misfit_before: before, misfit_after: after };
             let adjusted = Adjusted { views, poses, record };
-            Ok(Some(AdjustedFit { adjusted, made: is_full_size.then_some(made) }))
+            Ok(Some(AdjustedFit { adjusted, made: is_full_size.then(|| Arc::new(made) as MadeFit) }))
         };
         if before <= small_misfit(self.stands.views.len()) || before >= LARGE_MISFIT {
             return outcome(start, false, None, made);
@@ -163,11 +163,12 @@ impl Adjuster<'_> {
                 let share = f64::from(number) / f64::from(N_CYCLES + 2);
                 let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
                 let config = stage.config(self.config, seed);
-                let start = match &earlier {
-                    None => Start::Seeds,
-                    Some(field) if number == first => Start::Reseeded(field),
-                    Some(field) => Start::Earlier(field),
-                };
+                let goes_on = earlier.is_some() && number > first;
+                let step = if goes_on { carried_step(&config.gaussians) } else { 0 };
+                let end =
+                    if goes_on { step + MORE_ITERATIONS } else { FIRST_ITERATIONS.min(config.gaussians.iterations) };
+                let earlier_fit = earlier.as_ref().map(|field| Earlier { field, step, reseeds: !goes_on });
+                let start = Start { earlier: earlier_fit, end, prunes: false };
                 let fit = self.fit(&self.stands.at(&poses), &config, start, &mut || observe(share))?;
                 let Some(Fitted { trainer, .. }) = fit else { return Ok(None) };
                 earlier = Some(trainer.deformable()?).filter(|field| !field.rest.rows.is_empty());
@@ -205,7 +206,8 @@ impl Adjuster<'_> {
         dataset: &Dataset,
         proceed: &mut dyn FnMut() -> Result<()>,
     ) -> Result<Option<(f64, MadeGaussians)>> {
-        let fit = self.fit(dataset, self.config, Start::Run, proceed)?;
+        let start = Start { earlier: None, end: self.config.gaussians.iterations, prunes: true };
+        let fit = self.fit(dataset, self.config, start, proceed)?;
         let Some(Fitted { mut trainer, losses, fingerprint }) = fit else { return Ok(None) };
         let gaussians = DynamicGaussians::Deformable(trainer.deformable()?);
         let misfit = misfit(trainer.targets(), &trainer.images()?);
@@ -222,8 +224,9 @@ impl Adjuster<'_> {
         proceed: &mut dyn FnMut() -> Result<()>,
     ) -> Result<Option<Fitted>> {
         proceed()?;
-        let (config, from) = (&start.iterations(config), carried_step(&config.gaussians));
-        if start.is_seeded() {
+        let Start { earlier, end, prunes } = start;
+        let config = &Config { gaussians: Gaussians { iterations: end, ..config.gaussians.clone() }, ..config.clone() };
+        if earlier.is_none_or(|earlier| earlier.reseeds) {
             self.motion.carve(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
         }
         let targets = match Targets::new(dataset, &self.motion, &config.gaussians) {
@@ -235,38 +238,19 @@ impl Adjuster<'_> {
             return Ok(None);
         }
         let fingerprint = fingerprint(&targets, config);
-        let mut trainer = match start {
-            Start::Run | Start::Seeds => DeformableTrainer::new(self.gpu, targets, config)?,
-            Start::Reseeded(earlier) => DeformableTrainer::reseeded(self.gpu, targets, config, earlier)?,
-            Start::Earlier(earlier) => DeformableTrainer::going_on(self.gpu, targets, config, earlier, from)?,
+        let mut trainer = match earlier {
+            None => DeformableTrainer::new(self.gpu, targets, config)?,
+            Some(earlier) => DeformableTrainer::after(self.gpu, targets, config, earlier)?,
         };
-        if !matches!(start, Start::Run) {
+        if !prunes {
             trainer.keep_unsupported();
         }
         let mut losses = Vec::new();
-        while trainer.step() < config.gaussians.iterations {
+        while trainer.step() < end {
             proceed()?;
-            losses.extend(trainer.advance(config.gaussians.iterations)?);
+            losses.extend(trainer.advance(end)?);
         }
         Ok(Some(Fitted { trainer, losses, fingerprint }))
-    }
-}
-
-impl Start<'_> {
-    /// Tells whether seeds are placed in the hull.
-    fn is_seeded(self) -> bool {
-        !matches!(self, Start::Earlier(_))
-    }
-
-    /// Returns settings with the number of iterations of such a fit.
-    fn iterations(self, config: &Config) -> Config {
-        let mut config = config.clone();
-        config.gaussians.iterations = match self {
-            Start::Run => config.gaussians.iterations,
-            Start::Seeds | Start::Reseeded(_) => FIRST_ITERATIONS.min(config.gaussians.iterations),
-            Start::Earlier(_) => carried_step(&config.gaussians) + MORE_ITERATIONS,
-        };
-        config
     }
 }
 

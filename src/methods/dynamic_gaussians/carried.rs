@@ -1,10 +1,9 @@
-//! Goes on from a deformable set that was fitted before frames were added, or geometry stated anew, instead of beginning from seeds.
+//! Judges whether a fit goes on from a deformable set that was fitted before frames were added, or geometry stated anew, instead of
+//! beginning from seeds.
 
 use crate::config::Config;
 use crate::error::Result;
 use crate::gaussians::field::DeformableGaussians;
-use crate::gaussians::particles::Particles;
-use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use crate::methods::dynamic_gaussians::setup;
 use crate::methods::dynamic_gaussians::targets::Targets;
@@ -12,54 +11,36 @@ use crate::methods::dynamic_gaussians::targets::Targets;
 /// Minimum share of the images of each view and phase that an earlier deformable set must explain to be carried over.
 const MIN_EXPLAINED: f64 = 0.7;
 
-/// Result of an attempt to go on.
-pub(super) enum Carried {
-    /// The fit goes on from the earlier deformable set.
-    On(Box<DeformableTrainer>),
-    /// The earlier deformable set does not explain these images: they are to be fitted anew.
-    Anew(Box<Targets>),
+/// Tells whether a fit can go on from an earlier deformable set: whether it has the same phases and views and the same shape, and whether
+/// iterations are left to go on with.
+pub(super) fn can_go_on(targets: &Targets, config: &Config, earlier: &DeformableGaussians) -> bool {
+    let (was, phases_alike) = (&earlier.rest.setup, earlier.rest.n_phases == targets.n_phases);
+    let rests_alike = earlier.setup.rest_phase as usize == targets.rest_phase;
+    let has_room = setup::carried_step(&config.gaussians) < config.gaussian_iterations();
+    // An additional view tells more than a fit that was done without it can take in.
+    let seen_alike = was.n_views as usize == targets.n_views;
+    let shape = setup::deformable_setup(targets, &targets.deformable(&config.deformable));
+    phases_alike && rests_alike && seen_alike && has_room && shape.n_basis == earlier.setup.n_basis
 }
 
-impl Carried {
-    fn anew(targets: Targets) -> Carried {
-        Carried::Anew(Box::new(targets))
-    }
-
-    /// Goes on from an earlier deformable set, unless it has another shape or leaves much of a view or a phase unexplained.
-    ///
-    /// # Errors
-    /// As [`DeformableTrainer::with`].
-    pub(super) fn new(gpu: &Gpu, targets: Targets, config: &Config, earlier: &DeformableGaussians) -> Result<Carried> {
-        let (was, phases_alike) = (&earlier.rest.setup, earlier.rest.n_phases == targets.n_phases);
-        let rests_alike = earlier.setup.rest_phase as usize == targets.rest_phase;
-        let has_room = setup::carried_step(&config.gaussians) < config.gaussian_iterations();
-        // An additional view tells more than a fit that was done without it can take in.
-        let seen_alike = was.n_views as usize == targets.n_views;
-        if !(phases_alike && rests_alike && seen_alike && has_room) || earlier.rest.rows.is_empty() {
-            return Ok(Carried::anew(targets));
-        }
-        let rest = earlier.rest.in_units(targets.units);
-        let mut trainer = DeformableTrainer::with(gpu, targets, config, &Particles::fresh(rest.rows.clone()))?;
-        let setup = *trainer.deformable_setup();
-        if setup.n_basis != earlier.setup.n_basis {
-            return Ok(Carried::anew(trainer.into_targets()));
-        }
-        trainer.move_as(&earlier.on_grid(rest, setup), setup::carried_step(&config.gaussians))?;
-        let explained = min_explained(trainer.targets(), &trainer.images()?).unwrap_or(0.0);
-        let percent = 100.0 * explained;
-        if explained < MIN_EXPLAINED {
-            tracing::info!(
-                "Gaussians are fitted from the start, because the earlier ones explain only {percent:.0} % of some \
-                 view or phase"
-            );
-            return Ok(Carried::anew(trainer.into_targets()));
-        }
+/// Tells whether a fit that goes on from an earlier deformable set explains most of every view and phase.
+///
+/// # Errors
+/// Device errors.
+pub(super) fn explains_all(trainer: &DeformableTrainer) -> Result<bool> {
+    let explained = min_explained(trainer.targets(), &trainer.images()?).unwrap_or(0.0);
+    let percent = 100.0 * explained;
+    if explained < MIN_EXPLAINED {
         tracing::info!(
-            "the fit continues from the earlier Gaussians, which explain at least {percent:.0} % of every view and \
+            "Gaussians are fitted from the start, because the earlier ones explain only {percent:.0} % of some view or \
              phase"
         );
-        Ok(Carried::On(Box::new(trainer)))
+    } else {
+        tracing::info!(
+            "the fit continues from the earlier Gaussians, which explain at least {percent:.0} % of every view and phase"
+        );
     }
+    Ok(explained >= MIN_EXPLAINED)
 }
 
 /// Share of what vessels are known to add to the images that a field explains: the minimum over all views and phases; none

@@ -42,6 +42,17 @@ const TRACKED_REACH: f64 = 2.0;
 /// Minimum filling at the phases whose images decide where new Gaussians are placed.
 const MOSTLY_FILLED: f64 = 0.5;
 
+/// Earlier field with which a fit of a deformable set begins.
+#[derive(Clone, Copy)]
+pub struct Earlier<'a> {
+    /// The field. It may have been fitted to other images of the same vessels.
+    pub field: &'a DeformableGaussians,
+    /// Iteration at which the fit begins.
+    pub step: u32,
+    /// Whether Gaussians are seeded anew and only move as those of the field; otherwise the fit goes on from these.
+    pub reseeds: bool,
+}
+
 /// A run on a device.
 pub struct DeformableTrainer {
     gpu: Gpu,
@@ -166,22 +177,48 @@ impl DeformableTrainer {
         })
     }
 
-    /// Goes on, at an iteration, from a deformable set that was fitted to other images of the same vessels.
+    /// Begins with an earlier field.
     ///
     /// # Errors
     /// As [`DeformableTrainer::with`].
-    pub(super) fn going_on(
-        gpu: &Gpu,
-        targets: Targets,
-        config: &Config,
-        earlier: &DeformableGaussians,
-        step: u32,
-    ) -> Result<DeformableTrainer> {
-        let rest = earlier.rest.in_units(targets.units);
+    pub fn after(gpu: &Gpu, targets: Targets, config: &Config, earlier: Earlier<'_>) -> Result<DeformableTrainer> {
+        let rest = earlier.field.rest.in_units(targets.units);
         let mut trainer = DeformableTrainer::with(gpu, targets, config, &Particles::fresh(rest.rows.clone()))?;
-        let setup = *trainer.deformable_setup();
-        trainer.move_as(&earlier.on_grid(rest, setup), step)?;
+        let moving = earlier.field.on_grid(rest, trainer.joint.deformable);
+        trainer.gpu.upload(&trainer.joint.grid.motion_grid, 0, &moving.grid)?;
+        trainer.gpu.upload(&trainer.members.own.own_motion, 0, &moving.own)?;
+        if let (Some(buffers), Some(filling)) = (&trainer.members.filling, &moving.filling) {
+            trainer.gpu.upload(&buffers.filling, 0, filling)?;
+        }
+        trainer.step = earlier.step;
+        trainer.gpu.upload(&trainer.joint.targets.gaussian_step, 0, &[trainer.step])?;
+        if earlier.reseeds {
+            trainer.reseed()?;
+        }
         Ok(trainer)
+    }
+
+    /// Replaces the Gaussians by seeds of the rest phase, each of which moves and is filled as its nearest neighbour among them.
+    fn reseed(&mut self) -> Result<()> {
+        if self.config.gaussians.background_every > 0 {
+            // The seeds need the bounds on the host.
+            self.renew_background(Renewal::OneOfSeveral)?;
+        }
+        let (targets, moving) = (&self.targets, self.deformable()?);
+        let settings = targets.lengths.gaussians(&self.config.gaussians);
+        let mut rows = seeds::seeds_at(targets, &settings, self.config.seed, targets.rest_phase);
+        self.replace_by(rows.clone(), &moving)?;
+        let density = seeds::first_density(&self.targets, &self.images()?);
+        rows.iter_mut().for_each(|g| g.log_density = density.ln() as f32);
+        self.replace_by(rows, &moving)
+    }
+
+    /// Replaces all Gaussians by others of the rest phase, each of which moves and is filled as its nearest neighbour in `deformable`, a
+    /// set on the grid of this fit.
+    fn replace_by(&mut self, rows: Vec<Gaussian>, deformable: &DeformableGaussians) -> Result<()> {
+        let mut members = Members::none(self.members.filling.is_some());
+        members.append(rows, deformable);
+        self.replace(&members)
     }
 
     /// Returns the fit by which the grid is tracked.
@@ -272,18 +309,6 @@ impl DeformableTrainer {
         self.targets
     }
 
-    /// Gives the Gaussians, which were fitted before, the motion of a deformable set of the same Gaussians on the same grid; iterations
-    /// go on from `step`.
-    pub(super) fn move_as(&mut self, deformable: &DeformableGaussians, step: u32) -> Result<()> {
-        self.gpu.upload(&self.joint.grid.motion_grid, 0, &deformable.grid)?;
-        self.gpu.upload(&self.members.own.own_motion, 0, &deformable.own)?;
-        if let (Some(buffers), Some(filling)) = (&self.members.filling, &deformable.filling) {
-            self.gpu.upload(&buffers.filling, 0, filling)?;
-        }
-        self.step = step;
-        Ok(self.gpu.upload(&self.joint.targets.gaussian_step, 0, &[self.step])?)
-    }
-
     /// Constants of the run.
     pub fn setup(&self) -> &GaussianSetup {
         &self.joint.setup
@@ -367,17 +392,9 @@ impl DeformableTrainer {
     }
 
     /// Estimates the static background anew from what the Gaussians leave of the images, and with it the bounds of the fit's targets.
-    pub(super) fn renew_background(&mut self, renewal: Renewal) -> Result<()> {
+    fn renew_background(&mut self, renewal: Renewal) -> Result<()> {
         let images = self.images()?;
         renew_bounds(&self.gpu, &mut self.targets, &self.joint.parts, &self.joint.setup, &images, renewal)
-    }
-
-    /// Replaces all Gaussians by others of the rest phase, each of which moves and is filled as its nearest neighbour in `deformable`, a
-    /// set on the grid of this fit.
-    pub(super) fn reseed(&mut self, rows: Vec<Gaussian>, deformable: &DeformableGaussians) -> Result<()> {
-        let mut members = Members::none(self.members.filling.is_some());
-        members.append(rows, deformable);
-        self.replace(&members)
     }
 
     /// Drops weak Gaussians and places new ones where data are missing at half the phases. This happens once in a run, on the

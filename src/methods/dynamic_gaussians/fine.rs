@@ -3,7 +3,7 @@
 use crate::config::Config;
 use crate::error::Result;
 use crate::gpu::device::Gpu;
-use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Earlier};
 use crate::methods::dynamic_gaussians::remainder::MIN_PHASES;
 use crate::methods::dynamic_gaussians::setup;
 use crate::methods::dynamic_gaussians::targets::Targets;
@@ -45,6 +45,7 @@ impl Fine {
     /// # Errors
     /// As [`DeformableTrainer::with`] and [`DeformableTrainer::deformable`].
     pub(crate) fn go_on(self, coarse: &DeformableTrainer) -> Result<DeformableTrainer> {
-        DeformableTrainer::going_on(&self.gpu, self.targets, &self.config, &coarse.deformable()?, self.from)
+        let earlier = Earlier { field: &coarse.deformable()?, step: self.from, reseeds: false };
+        DeformableTrainer::after(&self.gpu, self.targets, &self.config, earlier)
     }
 }

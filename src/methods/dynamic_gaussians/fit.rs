@@ -3,13 +3,14 @@
 use crate::choice::Choice;
 use crate::config::{Config, GaussianForm};
 use crate::error::{Error, Result};
-use crate::fitting::fit::{FitWork, TimedFit};
+use crate::fitting::fit::{Advance, FitProgress, FitWork, Iterates, Measured};
+use crate::fitting::losses::StepLoss;
 use crate::gaussians::field::DynamicGaussians;
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
-use crate::methods::dynamic_gaussians::carried::Carried;
-use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::carried::{can_go_on, explains_all};
+use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Earlier};
 use crate::methods::dynamic_gaussians::fine::Fine;
 use crate::methods::dynamic_gaussians::made::Made;
 use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
@@ -29,57 +30,37 @@ pub(crate) enum GaussianFit {
 }
 
 impl GaussianFit {
-    /// Begins a fit of the form that configuration and data ask for.
+    /// Begins a fit of the form that configuration and data ask for. One set for the beat goes on from an earlier field where that is of
+    /// use, or takes its motion.
     ///
     /// # Errors
-    /// As [`GaussianTrainer::new`] and [`DeformableStart::new`].
-    pub(crate) fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<GaussianFit> {
-        Ok(match targets.form(config.gaussians.form) {
-            GaussianForm::Deformable => {
-                let (targets, fine) = Fine::split(gpu, targets, config);
-                GaussianFit::Start(Box::new(DeformableStart::new(gpu, targets, config)?), fine)
-            }
-            _ => GaussianFit::PerPhase(Box::new(GaussianTrainer::new(gpu, targets, config)?)),
-        })
-    }
-
-    /// Begins a fit from new seeds that move as an earlier fit to the same images, where there is one set for the beat.
-    ///
-    /// # Errors
-    /// As [`GaussianFit::new`] and [`DeformableTrainer::with`].
-    pub(crate) fn reseeded(
-        gpu: &Gpu,
-        targets: Targets,
-        config: &Config,
-        earlier: &DynamicGaussians,
-    ) -> Result<GaussianFit> {
-        let Some(earlier) = earlier.deformable().filter(|earlier| !earlier.rest.rows.is_empty()) else {
-            return GaussianFit::new(gpu, targets, config);
-        };
-        let (targets, fine) = Fine::split(gpu, targets, config);
-        let fit = DeformableTrainer::reseeded(gpu, targets, config, earlier)?;
-        Ok(GaussianFit::Deformable(Box::new(fit), fine))
-    }
-
-    /// As [`GaussianFit::new`], but goes on from what was fitted to `earlier` data where that is of use.
-    ///
-    /// # Errors
-    /// As [`GaussianFit::new`] and [`Carried::new`].
-    pub(crate) fn after(
+    /// As [`GaussianTrainer::new`], [`DeformableStart::new`] and [`DeformableTrainer::with`].
+    pub(crate) fn new(
         gpu: &Gpu,
         mut targets: Targets,
         config: &Config,
-        earlier: &DynamicGaussians,
+        earlier: Option<Earlier<'_>>,
     ) -> Result<GaussianFit> {
-        if let (GaussianForm::Deformable, Some(deformable)) =
-            (targets.form(config.gaussians.form), earlier.deformable())
-        {
-            match Carried::new(gpu, targets, config, deformable)? {
-                Carried::On(fit) => return Ok(GaussianFit::Deformable(fit, None)),
-                Carried::Anew(same) => targets = *same,
-            }
+        if targets.form(config.gaussians.form) != GaussianForm::Deformable {
+            return Ok(GaussianFit::PerPhase(Box::new(GaussianTrainer::new(gpu, targets, config)?)));
         }
-        GaussianFit::new(gpu, targets, config)
+        match earlier.filter(|earlier| !earlier.field.rest.rows.is_empty()) {
+            Some(earlier) if earlier.reseeds => {
+                let (targets, fine) = Fine::split(gpu, targets, config);
+                let fit = DeformableTrainer::after(gpu, targets, config, earlier)?;
+                return Ok(GaussianFit::Deformable(Box::new(fit), fine));
+            }
+            Some(earlier) if can_go_on(&targets, config, earlier.field) => {
+                let fit = DeformableTrainer::after(gpu, targets, config, earlier)?;
+                if explains_all(&fit)? {
+                    return Ok(GaussianFit::Deformable(Box::new(fit), None));
+                }
+                targets = fit.into_targets();
+            }
+            _ => {}
+        }
+        let (targets, fine) = Fine::split(gpu, targets, config);
+        Ok(GaussianFit::Start(Box::new(DeformableStart::new(gpu, targets, config)?), fine))
     }
 
     /// Tells whether the field of a fit of `end` iterations is worth more than one that was fitted to fewer frames. A fit starts again
@@ -217,28 +198,25 @@ fn not_begun() -> Error {
     Error::Internal("no iteration of the Gaussians is under way".into())
 }
 
-impl TimedFit for GaussianFit {
-    fn form(&self) -> Option<&'static str> {
-        Some(GaussianFit::form(self).name())
+impl Iterates for GaussianFit {
+    fn progress(&self) -> FitProgress {
+        FitProgress { preparation: self.preparation(), ..FitProgress::at(self.step()) }
     }
 
-    fn step(&self) -> u32 {
-        GaussianFit::step(self)
+    fn advance(&mut self, until: u32) -> Result<Advance> {
+        let first = self.step() + 1;
+        let losses = GaussianFit::advance(self, until)?.into_iter().zip(first..);
+        Ok(Advance::of(losses.map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect()))
     }
+}
 
-    fn is_prepared(&self) -> bool {
-        self.preparation().is_none()
-    }
-
-    fn advance(&mut self, until: u32) -> Result<usize> {
-        GaussianFit::advance(self, until).map(|losses| losses.len())
-    }
-
-    fn work(&self) -> Result<FitWork> {
-        Ok(FitWork { count: self.count(), work: GaussianFit::work(self)? })
-    }
-
+impl Measured for GaussianFit {
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         GaussianFit::profile_step(self)
+    }
+
+    fn work(&self) -> Result<Option<FitWork>> {
+        let form = Some(self.form().name());
+        Ok(Some(FitWork { form, count: self.count(), work: GaussianFit::work(self)? }))
     }
 }

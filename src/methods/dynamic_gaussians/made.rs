@@ -3,9 +3,21 @@
 
 use crate::config::Config;
 use crate::fingerprint::Fingerprint;
-use crate::fitting::fit::MadeGaussians;
 use crate::gaussians::field::DynamicGaussians;
 use crate::methods::dynamic_gaussians::targets::Targets;
+
+/// A fit of Gaussians that was done before its run begins.
+#[derive(Debug, Clone)]
+pub struct MadeGaussians {
+    /// The field after all iterations.
+    pub gaussians: DynamicGaussians,
+    /// Loss of each iteration.
+    pub losses: Vec<f64>,
+    /// Findings about the data, for the user.
+    pub findings: Vec<String>,
+    /// Fingerprint of the data and the settings of the fit.
+    pub fingerprint: String,
+}
 
 /// A fit that is done, whose losses are still to be reported.
 pub(crate) struct Made {

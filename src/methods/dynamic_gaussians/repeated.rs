@@ -2,11 +2,12 @@
 
 use crate::config::Config;
 use crate::error::{Error, Result};
-use crate::fitting::fit::MadeGaussians;
 use crate::gaussians::field::DynamicGaussians;
 use crate::gpu::device::Gpu;
+use crate::methods::dynamic_gaussians::deformable::Earlier;
 use crate::methods::dynamic_gaussians::fit::GaussianFit;
-use crate::methods::dynamic_gaussians::made::Made;
+use crate::methods::dynamic_gaussians::made::{Made, MadeGaussians};
+use crate::methods::dynamic_gaussians::setup;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
 /// Difference of the seeds of one fit and the next.
@@ -52,154 +53,150 @@ impl Targets {
 /// take their motion from it, and its iterations are reported when they are done.
 pub(crate) struct Repeated {
     gpu: Gpu,
-    /// Images of the other fits that are left; none for a single fit.
-    targets: Option<Targets>,
     config: Config,
+    /// Number of all fits.
     fits: u32,
-    /// Fit that is under way: the run's, one of the others, or the run's again, to report its iterations.
+    /// Fit that is under way.
     fit: GaussianFit,
-    /// Losses of the run's fit while it is the first of several.
-    losses: Vec<f64>,
-    /// The run's fit while the others are made.
-    own: Option<Made>,
-    /// Fields of the other fits that are done.
-    others: Vec<DynamicGaussians>,
-    /// Findings of these fits that were not taken yet.
-    findings: Vec<String>,
-    /// Mean of the fields that are done, which is shown meanwhile.
-    so_far: Option<DynamicGaussians>,
-    was_coarse: bool,
+    stage: Stage,
+    /// Whether the first fit begins on coarser images.
+    begins_coarse: bool,
+}
+
+/// Fit that is under way, with the results of those before it.
+enum Stage {
+    /// The run's fit: the only one, or its iterations again, to report them, with the mean of all fits.
+    Run { mean: Option<DynamicGaussians> },
+    /// The first of several fits.
+    First { images: Targets, losses: Vec<f64> },
+    /// One of the other fits, with the images for those after it, and the mean of those before it.
+    Other { images: Option<Targets>, first: Made, others: Vec<DynamicGaussians>, mean: DynamicGaussians },
 }
 
 impl Repeated {
-    /// Begins the number of fits that configuration and data ask for. A fit that was made before is not repeated if it is the run's.
+    /// Begins the number of fits that configuration and data ask for. A fit that was made before is not repeated if it is the run's. With an
+    /// earlier field, there is a single fit.
     ///
     /// # Errors
     /// As [`GaussianFit::new`].
-    pub(crate) fn new(gpu: &Gpu, targets: Targets, config: &Config, made: Option<&MadeGaussians>) -> Result<Repeated> {
-        let made = made.and_then(|made| Made::of(made, &targets, config));
-        let fits = targets.fits(config.gaussians.fits).0.max(1);
-        let for_others = (fits > 1).then(|| targets.clone());
-        let fit = match made {
-            Some(made) => GaussianFit::Made(Box::new(made)),
-            None => GaussianFit::new(gpu, targets, config)?,
+    pub(crate) fn new(
+        gpu: &Gpu,
+        targets: Targets,
+        config: &Config,
+        earlier: Option<&DynamicGaussians>,
+        made: Option<&MadeGaussians>,
+    ) -> Result<Repeated> {
+        let step = setup::carried_step(&config.gaussians);
+        let fits = if earlier.is_some() { 1 } else { targets.fits(config.gaussians.fits).0.max(1) };
+        let stage = match fits {
+            1 => Stage::Run { mean: None },
+            _ => Stage::First { images: targets.clone(), losses: Vec::new() },
         };
-        Ok(Repeated { fits, targets: for_others, ..Repeated::once(gpu, config, fit) })
-    }
-
-    /// Takes a single fit.
-    pub(crate) fn once(gpu: &Gpu, config: &Config, fit: GaussianFit) -> Repeated {
-        Repeated {
-            gpu: gpu.clone(),
-            targets: None,
-            config: config.clone(),
-            fits: 1,
-            losses: Vec::new(),
-            own: None,
-            others: Vec::new(),
-            findings: Vec::new(),
-            so_far: None,
-            was_coarse: fit.is_coarse(),
-            fit,
-        }
+        let fit = match made.and_then(|made| Made::of(made, &targets, config)) {
+            Some(made) => GaussianFit::Made(Box::new(made)),
+            None => {
+                let earlier = earlier.and_then(|earlier| earlier.deformable());
+                let earlier = earlier.map(|field| Earlier { field, step, reseeds: false });
+                GaussianFit::new(gpu, targets, config, earlier)?
+            }
+        };
+        let begins_coarse = fit.is_coarse();
+        Ok(Repeated { gpu: gpu.clone(), config: config.clone(), fits, fit, stage, begins_coarse })
     }
 
     /// Tells whether the field of a fit of `end` iterations is worth more than one that was fitted to fewer frames.
     pub(crate) fn is_presentable(&self, end: u32) -> bool {
-        self.so_far.is_some() || self.fits == 1 && self.fit.is_presentable(end)
-    }
-
-    /// Tells whether the iterations of the fit that is under way are reported as those of the run.
-    fn is_last(&self) -> bool {
-        self.others.len() + 1 >= self.fits as usize
+        match &self.stage {
+            Stage::Run { mean: None } => self.fit.is_presentable(end),
+            Stage::First { .. } => false,
+            Stage::Run { mean: Some(_) } | Stage::Other { .. } => true,
+        }
     }
 
     /// Tells whether the run's iterations use coarser images so far.
     pub(crate) fn is_coarse(&self) -> bool {
-        if self.is_last() { self.fit.is_coarse() } else { self.was_coarse }
+        match &self.stage {
+            Stage::Run { .. } => self.fit.is_coarse(),
+            Stage::First { .. } | Stage::Other { .. } => self.begins_coarse,
+        }
     }
 
     /// Returns the iterations of the run that are done.
     pub(crate) fn step(&self) -> u32 {
-        if self.is_last() { self.fit.step() } else { 0 }
+        match &self.stage {
+            Stage::Run { .. } => self.fit.step(),
+            Stage::First { .. } | Stage::Other { .. } => 0,
+        }
     }
 
     /// Returns the share done of the preparation before the first iteration of the run; none when that has begun.
     pub(crate) fn preparation(&self) -> Option<f64> {
+        let of_fit = self.fit.preparation();
         let iterated = f64::from(self.fit.step()) / f64::from(self.config.gaussian_iterations().max(1));
-        let of_fit = match self.fit.preparation() {
-            Some(share) if self.is_last() => share,
-            None if self.is_last() => return None,
-            Some(share) => 0.5 * share,
+        let done = match &self.stage {
+            Stage::Run { .. } => return of_fit,
+            Stage::First { .. } => of_fit.map_or(0.5 + 0.5 * iterated, |share| 0.5 * share),
             // The run's fit was prepared before; the others need no preparation.
-            None if self.own.is_none() => 0.5 + 0.5 * iterated,
-            None => iterated,
+            Stage::Other { others, .. } => (others.len() + 1) as f64 + of_fit.map_or(iterated, |share| 0.5 * share),
         };
-        let done = self.others.len() + usize::from(self.own.is_some());
-        Some((done as f64 + of_fit) / f64::from(self.fits))
+        Some(done / f64::from(self.fits))
     }
 
-    /// Runs some iterations towards `until`; returns the losses of those of the run.
+    /// Runs some iterations towards `until`; returns the losses of those of the run, and findings about the data, for the user.
     ///
     /// # Errors
     /// As [`GaussianFit::advance`].
-    pub(crate) fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
-        if self.is_last() {
-            return self.fit.advance(until);
-        }
+    pub(crate) fn advance(&mut self, until: u32) -> Result<(Vec<f64>, Vec<String>)> {
         let end = self.config.gaussian_iterations();
-        let losses = self.fit.advance(end)?;
-        if self.own.is_none() {
-            self.losses.extend(losses);
-        }
-        if self.fit.step() >= end {
-            let findings = self.findings_of_fit();
-            self.findings.extend(findings);
-            self.fit = self.next()?;
-        }
-        Ok(Vec::new())
-    }
-
-    /// Keeps the fit that is done, and begins the next one.
-    fn next(&mut self) -> Result<GaussianFit> {
-        let field = self.fit.field()?;
-        let own = match self.own.take() {
-            Some(own) => {
-                self.others.push(field);
-                own
-            }
-            None => Made::done(field, std::mem::take(&mut self.losses)),
+        let (number, until) = match &self.stage {
+            Stage::Run { .. } => (1, until),
+            Stage::First { .. } => (1, end),
+            Stage::Other { others, .. } => (others.len() + 2, end),
         };
-        self.so_far = Some(self.mean_with(own.field())?);
-        if self.is_last() {
-            return Ok(GaussianFit::Made(Box::new(own)));
+        let mut losses = self.fit.advance(until)?;
+        match &mut self.stage {
+            Stage::Run { .. } => return Ok((losses, self.findings_of(number))),
+            Stage::First { losses: all, .. } => all.append(&mut losses),
+            Stage::Other { .. } => {}
         }
-        let number = self.others.len() as u32 + 1;
-        let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
-        let (targets, config) = (self.images(number)?, Config { seed, ..self.config.clone() });
-        let fit = GaussianFit::reseeded(&self.gpu, targets, &config, own.field())?;
-        self.own = Some(own);
-        Ok(fit)
-    }
-
-    /// Returns findings of all fits about the data since the last call, for the user.
-    pub(crate) fn take_findings(&mut self) -> Vec<String> {
-        let last = if self.is_last() { self.findings_of_fit() } else { Vec::new() };
-        std::mem::take(&mut self.findings).into_iter().chain(last).collect()
+        if self.fit.step() < end {
+            return Ok(Default::default());
+        }
+        let findings = self.findings_of(number);
+        self.begin_next()?;
+        Ok((Vec::new(), findings))
     }
 
     /// Takes the findings of the fit that is under way, which name it where there are several.
-    fn findings_of_fit(&mut self) -> Vec<String> {
-        let number = if self.own.is_some() { self.others.len() + 2 } else { 1 };
+    fn findings_of(&mut self, number: usize) -> Vec<String> {
         let fits = self.fits;
         let named = |finding| if fits > 1 { format!("fit {number} of {fits}: {finding}") } else { finding };
         self.fit.take_findings().into_iter().map(named).collect()
     }
 
-    /// Returns the images of one of the other fits. The last one takes them over.
-    fn images(&mut self, number: u32) -> Result<Targets> {
-        let images = if number + 1 == self.fits { self.targets.take() } else { self.targets.clone() };
-        images.ok_or_else(|| Error::Internal("there are no images for another fit".into()))
+    /// Keeps the fit that is done, and begins the next one: another fit, or the run's again.
+    fn begin_next(&mut self) -> Result<()> {
+        let field = self.fit.field()?;
+        let (images, first, others) = match std::mem::replace(&mut self.stage, Stage::Run { mean: None }) {
+            Stage::Run { .. } => return Ok(()),
+            Stage::First { images, losses } => (Some(images), Made::done(field, losses), Vec::new()),
+            Stage::Other { images, first, mut others, .. } => {
+                others.push(field);
+                (images, first, others)
+            }
+        };
+        let mean = mean(&std::iter::once(first.field()).chain(&others).cloned().collect::<Vec<_>>())?;
+        let Some(images) = images else {
+            (self.fit, self.stage) = (GaussianFit::Made(Box::new(first)), Stage::Run { mean: Some(mean) });
+            return Ok(());
+        };
+        let number = others.len() as u32 + 1;
+        let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
+        let left = (number + 1 < self.fits).then(|| images.clone());
+        let earlier = first.field().deformable().map(|field| Earlier { field, step: 0, reseeds: true });
+        self.fit = GaussianFit::new(&self.gpu, images, &Config { seed, ..self.config.clone() }, earlier)?;
+        self.stage = Stage::Other { images: left, first, others, mean };
+        Ok(())
     }
 
     /// Returns the field: the mean of all fits that are done, or the field of the first fit.
@@ -207,12 +204,10 @@ impl Repeated {
     /// # Errors
     /// As [`GaussianFit::field`].
     pub(crate) fn field(&self) -> Result<DynamicGaussians> {
-        self.so_far.as_ref().map_or_else(|| self.fit.field(), |so_far| Ok(so_far.clone()))
-    }
-
-    /// Returns the mean of the run's field and those of the other fits that are done.
-    fn mean_with(&self, own: &DynamicGaussians) -> Result<DynamicGaussians> {
-        mean(&std::iter::once(own).chain(&self.others).cloned().collect::<Vec<_>>())
+        match &self.stage {
+            Stage::Run { mean: Some(mean) } | Stage::Other { mean, .. } => Ok(mean.clone()),
+            Stage::Run { mean: None } | Stage::First { .. } => self.fit.field(),
+        }
     }
 }
 

@@ -3,15 +3,13 @@
 
 use crate::config::{Config, sections};
 use crate::error::{Error, Result};
-use crate::gaussians::field::{DeformableGaussians, Gaussians, mass};
+use crate::gaussians::field::{Gaussians, mass};
 use crate::gaussians::particles::Particles;
 use crate::gpu::device::Gpu;
 use crate::kernels::layout::Gaussian;
 use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Fit};
 use crate::methods::dynamic_gaussians::per_phase::{GaussianTrainer, strong};
-use crate::methods::dynamic_gaussians::seeds;
 use crate::methods::dynamic_gaussians::stages::Track;
-use crate::methods::dynamic_gaussians::target_buffers::Renewal;
 use crate::methods::dynamic_gaussians::targets::Targets;
 use std::ops::Range;
 
@@ -197,32 +195,6 @@ fn tracks_by_contrast(targets: &Targets, sets: &Gaussians) -> Vec<Track> {
 }
 
 impl DeformableTrainer {
-    /// Starts from seeds of the rest phase that move as an earlier fit to images of the same vessels: no set per phase is fitted, and
-    /// nothing is tracked.
-    ///
-    /// # Errors
-    /// As [`DeformableTrainer::with`].
-    pub fn reseeded(
-        gpu: &Gpu,
-        targets: Targets,
-        config: &Config,
-        earlier: &DeformableGaussians,
-    ) -> Result<DeformableTrainer> {
-        let mut trainer = DeformableTrainer::going_on(gpu, targets, config, earlier, 0)?;
-        if config.gaussians.background_every > 0 {
-            // The seeds need the bounds on the host.
-            trainer.renew_background(Renewal::OneOfSeveral)?;
-        }
-        let (targets, moving) = (trainer.targets(), trainer.deformable()?);
-        let settings = targets.lengths.gaussians(&config.gaussians);
-        let mut rows = seeds::seeds_at(targets, &settings, config.seed, targets.rest_phase);
-        trainer.reseed(rows.clone(), &moving)?;
-        let density = seeds::first_density(trainer.targets(), &trainer.images()?);
-        rows.iter_mut().for_each(|g| g.log_density = density.ln() as f32);
-        trainer.reseed(rows, &moving)?;
-        Ok(trainer)
-    }
-
     /// Starts from targets alone, all of [`DeformableStart`] at once.
     ///
     /// # Errors

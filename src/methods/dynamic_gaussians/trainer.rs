@@ -1,20 +1,19 @@
 //! Fit of a run: Gaussians first, then the static field on what they leave of the images.
 
 use crate::error::Result;
-use crate::fields::state::PendingBehind;
 use crate::fields::trainer::{FieldsFit, SavedFields};
-use crate::fitting::fit::{Beginning, FieldFeed, Fit, FitField, FitStart, PendingFit, PreparedGaussians};
+use crate::fitting::fit::{
+    Advance, FieldFeed, Fit, FitField, FitProgress, FitStart, Iterates, Measured, PendingFit, SavedFit, Use,
+};
 use crate::fitting::ledger::Ledger;
 use crate::fitting::losses::{SMALLER_STEPS, StepLoss};
 use crate::gaussians::field::{DynamicGaussians, GaussianFeed};
 use crate::gaussians::pictures::Pictures;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
-use crate::kernels::tuning::Tuning;
 use crate::methods::dynamic_gaussians::data::{GaussianData, Shot};
 use crate::methods::dynamic_gaussians::fit::GaussianFit;
 use crate::methods::dynamic_gaussians::repeated::Repeated;
-use std::any::Any;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Gaussians of a run, and the static field behind them.
@@ -28,9 +27,7 @@ pub struct GaussiansFit {
     /// Circumstances of each training image.
     shots: Vec<Shot>,
     fields: FieldsFit,
-    /// Whether, since the last call of [`Fit::new_objective`], the static field or the fit to all pixels has begun.
-    has_new_objective: bool,
-    /// Findings about the data that were not taken yet.
+    /// Findings about the data that were made before the first submit.
     findings: Vec<String>,
 }
 
@@ -44,38 +41,26 @@ impl GaussiansFit {
     /// Errors of [`Repeated::new`] and [`FieldsFit::new`].
     pub(crate) fn new(data: GaussianData, start: &FitStart<'_>) -> Result<GaussiansFit> {
         let GaussianData { targets, fields, shots } = data;
-        let (gpu, config) = (start.gpu, start.config);
-        let resumed = start.from.resumed();
-        let earlier = match start.from {
-            Beginning::CarriedOn(saved) => saved.field.gaussians.as_ref(),
-            Beginning::AfterGaussians(gaussians) => Some(gaussians),
-            Beginning::Scratch | Beginning::Prepared(_) | Beginning::Resumed(_) => None,
-        };
-        let prepared = match start.from {
-            Beginning::Prepared(prepared) => prepared,
-            _ => PreparedGaussians::default(),
-        };
-        let done = resumed.and_then(SavedFields::of).map_or(0, |saved| saved.step());
-        let end = config.gaussian_iterations();
-        let saved = resumed.and_then(|saved| saved.field.gaussians.as_ref());
-        let (gaussians, field) = match saved.filter(|_| done >= end) {
+        let (gpu, config, from) = (start.gpu, start.config, start.from);
+        let gaussians_to = |wanted| from.field_to(wanted).and_then(|field| field.gaussians.as_ref());
+        let (earlier, saved_fields) = (gaussians_to(Use::GoOn), SavedFields::at(from));
+        let done = saved_fields.filter(|_| from.field_to(Use::Resume).is_some()).map_or(0, |saved| saved.step());
+        let (end, mut findings) = (config.gaussian_iterations(), Vec::new());
+        let (gaussians, field) = match gaussians_to(Use::Resume).filter(|_| done >= end) {
             Some(field) => (None, field.clone()),
             None => {
-                let mut fit = match earlier {
-                    Some(earlier) => Repeated::once(gpu, config, GaussianFit::after(gpu, targets, config, earlier)?),
-                    None => Repeated::new(gpu, targets, config, prepared.made)?,
-                };
+                let made = from.made.and_then(|made| made.downcast_ref());
+                let mut fit = Repeated::new(gpu, targets, config, earlier, made)?;
                 while fit.step() < done {
-                    fit.advance(done)?;
+                    findings.append(&mut fit.advance(done)?.1);
                 }
                 let field = fit.field()?;
                 (Some(fit), field)
             }
         };
-        let shown =
-            earlier.or(prepared.shown).filter(|_| gaussians.as_ref().is_some_and(|fit| !fit.is_presentable(end)));
+        let shown = earlier.or(gaussians_to(Use::Show));
+        let shown = shown.filter(|_| gaussians.as_ref().is_some_and(|fit| !fit.is_presentable(end)));
         let shows_earlier = shown.is_some();
-        let saved_fields = SavedFields::at(start.from);
         let done = match &gaussians {
             Some(fit) => fit.step(),
             None => saved_fields.map_or(0, |saved| saved.step()),
@@ -88,8 +73,7 @@ impl GaussiansFit {
             shows_earlier,
             shots,
             fields,
-            has_new_objective: false,
-            findings: Vec::new(),
+            findings,
         };
         // A field that was fitted before has left its images already.
         if fit.gaussians.is_none() {
@@ -108,24 +92,27 @@ impl GaussiansFit {
         self.feed.lock().unwrap_or_else(PoisonError::into_inner).1.clone()
     }
 
-    /// Runs some iterations of the Gaussians towards `until`, and ends their fit after `end` iterations; returns their losses.
-    fn advance_gaussians(&mut self, until: u32, end: u32) -> Result<Vec<f64>> {
-        let Some(fit) = &mut self.gaussians else { return Ok(Vec::new()) };
+    /// Runs some iterations of the Gaussians towards `until`, and ends their fit after `end` iterations.
+    fn advance_gaussians(&mut self, until: u32, end: u32) -> Result<Advance> {
+        let Some(fit) = &mut self.gaussians else { return Ok(Advance::default()) };
         let was_coarse = fit.is_coarse();
-        let losses = fit.advance(until.min(end))?;
-        self.findings.extend(fit.take_findings());
-        self.has_new_objective |= was_coarse && !fit.is_coarse();
+        let (losses, found) = fit.advance(until.min(end))?;
+        let has_new_objective = was_coarse && !fit.is_coarse();
         self.shows_earlier &= !fit.is_presentable(end);
-        if self.shows_earlier {
-            return Ok(losses);
+        if !self.shows_earlier {
+            let field = fit.field()?;
+            if fit.step() >= end {
+                self.gaussians = None;
+            }
+            let mut feed = self.feed.lock().unwrap_or_else(PoisonError::into_inner);
+            *feed = (feed.0 + 1, field);
         }
-        let field = fit.field()?;
-        if fit.step() >= end {
-            self.gaussians = None;
-        }
-        let mut feed = self.feed.lock().unwrap_or_else(PoisonError::into_inner);
-        *feed = (feed.0 + 1, field);
-        Ok(losses)
+        let first = self.fields.progress().step + 1;
+        self.fields.count(losses.len() as u32);
+        let losses = losses.into_iter().zip(first..).map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect();
+        let findings = std::mem::take(&mut self.findings).into_iter().chain(found).collect();
+        let smaller_steps = (has_new_objective || self.gaussians.is_none()).then_some(SMALLER_STEPS);
+        Ok(Advance { losses, smaller_steps, findings })
     }
 
     /// Gives the static field the line integrals of the images less those of the Gaussians.
@@ -142,46 +129,26 @@ impl GaussiansFit {
     }
 }
 
-impl Fit for GaussiansFit {
-    fn step(&self) -> u32 {
-        self.fields.step()
+impl Iterates for GaussiansFit {
+    fn progress(&self) -> FitProgress {
+        let preparation = self.gaussians.as_ref().and_then(Repeated::preparation);
+        FitProgress { preparation, shows_earlier: self.shows_earlier, ..self.fields.progress() }
     }
 
-    fn submitted(&self) -> u32 {
-        self.fields.submitted()
-    }
-
-    fn preparation(&self) -> Option<f64> {
-        self.gaussians.as_ref().and_then(Repeated::preparation)
-    }
-
-    fn shows_earlier(&self) -> bool {
-        self.shows_earlier
-    }
-
-    fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
-        if self.gaussians.is_none() || self.fields.step() >= until {
+    fn advance(&mut self, until: u32) -> Result<Advance> {
+        if self.gaussians.is_none() || self.fields.progress().step >= until {
             return self.fields.advance(until);
         }
         let end = self.fields.data().config.gaussian_iterations();
-        let losses = self.advance_gaussians(until, end)?;
+        let advance = self.advance_gaussians(until, end)?;
         if self.gaussians.is_none() {
             self.set_remaining_images()?;
-            self.has_new_objective = true;
         }
-        let first = self.fields.step() + 1;
-        self.fields.count(losses.len() as u32);
-        Ok(losses.into_iter().zip(first..).map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect())
+        Ok(advance)
     }
+}
 
-    fn new_objective(&mut self) -> Option<&'static str> {
-        std::mem::take(&mut self.has_new_objective).then_some(SMALLER_STEPS)
-    }
-
-    fn take_findings(&mut self) -> Vec<String> {
-        std::mem::take(&mut self.findings)
-    }
-
+impl Fit for GaussiansFit {
     fn outline(&self) -> FitField {
         FitField::of_gaussians(self.field())
     }
@@ -191,10 +158,21 @@ impl Fit for GaussiansFit {
         FieldFeed { params_fixed_until, gaussians: Some(self.feed.clone()), ..self.fields.feed() }
     }
 
-    fn snapshot(&self) -> Result<Box<dyn PendingFit>> {
-        Ok(Box::new(PendingBehind { fields: Box::new(self.fields.pending()?), gaussians: self.field() }))
+    fn snapshot(&self) -> Result<PendingFit> {
+        let (fields, gaussians) = (self.fields.pending()?, self.field());
+        Ok(Box::new(|| {
+            let SavedFit { field, state } = fields.wait()?;
+            // Gaussians need no hull once they are seeded.
+            Ok(SavedFit { field: FitField { gaussians: Some(gaussians), hull: None, ..field }, state })
+        }))
     }
 
+    fn measured(&mut self) -> Option<&mut dyn Measured> {
+        Some(self)
+    }
+}
+
+impl Measured for GaussiansFit {
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         if self.gaussians.is_some() {
             // The static field has no images before the Gaussians are fitted; its passes take as long with those that the run has.
@@ -204,19 +182,11 @@ impl Fit for GaussiansFit {
         self.fields.profile_step()
     }
 
-    fn tuning(&self) -> Option<&Tuning> {
-        self.fields.tuning()
-    }
-
     fn barriers(&self) -> Option<u32> {
         self.fields.barriers()
     }
 
     fn ledger(&self, live_samples: u64) -> Ledger {
         self.fields.ledger(live_samples)
-    }
-
-    fn as_any(&self) -> &dyn Any {
-        self
     }
 }

@@ -112,7 +112,7 @@ impl SaxDrawing {
 
 impl FieldDrawing for SaxDrawing {
     fn replace(&self, field: &dyn Field) -> Result<()> {
-        match field.as_any().downcast_ref::<SaxField>() {
+        match field.downcast::<SaxField>() {
             Some(field) => self.replace_field(field),
             None => Err(Error::Internal(
                 "the field belongs to another method than the field that the drawing was created for".into(),

@@ -1,15 +1,13 @@
 //! SAX-NeRF's field and the state of its fit behind the interfaces that all methods share.
 
 use crate::error::{Error, Result};
-use crate::fitting::fit::FitState;
+use crate::fitting::fit::{FitState, SavedState};
 use crate::gpu::device::Gpu;
 use crate::methods::sax_nerf::drawing::SaxDrawing;
 use crate::methods::sax_nerf::field::{SaxField, SaxState};
 use crate::methods::sax_nerf::tensors;
 use crate::model::Model;
 use crate::model::field::{Field, FieldDrawing};
-use crate::tensors::FileTensor;
-use std::any::Any;
 
 /// Key of the settings, and of the field in headers of checkpoints.
 pub(super) const KEY: &str = "sax";
@@ -40,23 +38,15 @@ impl Field for SaxField {
     fn drawing(&self, gpu: &Gpu) -> Result<Box<dyn FieldDrawing>> {
         Ok(Box::new(SaxDrawing::new(gpu, self)?))
     }
-
-    fn as_any(&self) -> &dyn Any {
-        self
-    }
 }
 
 impl FitState for SaxState {
-    fn tensors(&self, model: &Model) -> Result<Vec<FileTensor>> {
-        match model.field.as_ref().and_then(|field| field.as_any().downcast_ref::<SaxField>()) {
-            Some(field) => Ok(tensors::tensors(field, self)),
+    fn saved(&self, model: &Model) -> Result<SavedState> {
+        match model.field.as_ref().and_then(|field| field.downcast::<SaxField>()) {
+            Some(field) => Ok(SavedState::of_tensors(tensors::tensors(field, self))),
             None => {
                 Err(Error::Internal("a training state of SAX-NeRF was combined with a field of another method".into()))
             }
         }
-    }
-
-    fn as_any(&self) -> &dyn Any {
-        self
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::config::Config;
 use crate::error::{Error, Result};
-use crate::fitting::fit::{FieldFeed, Fit, FitField, PendingFit, SavedFit};
+use crate::fitting::fit::{Advance, FieldFeed, Fit, FitField, FitProgress, Iterates, Measured, PendingFit, SavedFit};
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::losses::StepLoss;
 use crate::fitting::ring::losses;
@@ -20,7 +20,6 @@ use crate::methods::sax_nerf::stages::{
     SaxFitBuffers, SaxKernels, SaxPass, SaxSampleBuffers, SaxSetBuffers, record_step,
 };
 use crate::methods::sax_nerf::start::first_params;
-use std::any::Any;
 use std::sync::Arc;
 
 /// Maximum number of passes of an iteration of a field, and of all fields together, without those over chunks of samples.
@@ -188,18 +187,21 @@ impl SaxTrainer {
     }
 }
 
-impl Fit for SaxTrainer {
-    fn step(&self) -> u32 {
-        self.step
+impl Iterates for SaxTrainer {
+    fn progress(&self) -> FitProgress {
+        FitProgress::at(self.step)
     }
 
-    fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
+    fn advance(&mut self, until: u32) -> Result<Advance> {
         let first = self.step + 1;
         let losses = SaxTrainer::advance(self, until)?;
         let attenuation = self.data.attenuation;
-        Ok(losses.into_iter().zip(first..).map(|(loss, step)| StepLoss::of_images(step, loss, attenuation)).collect())
+        let losses = losses.into_iter().zip(first..);
+        Ok(Advance::of(losses.map(|(loss, step)| StepLoss::of_images(step, loss, attenuation)).collect()))
     }
+}
 
+impl Fit for SaxTrainer {
     fn outline(&self) -> FitField {
         FitField::of_own(Arc::new(SaxTrainer::outline(self)))
     }
@@ -208,16 +210,18 @@ impl Fit for SaxTrainer {
         FieldFeed { own: self.params(), ..FieldFeed::default() }
     }
 
-    fn snapshot(&self) -> Result<Box<dyn PendingFit>> {
+    fn snapshot(&self) -> Result<PendingFit> {
         let (field, state) = SaxTrainer::state(self)?;
-        Ok(Box::new(SavedFit { field: FitField::of_own(Arc::new(field)), state: Arc::new(state) }))
+        Ok(Box::new(|| Ok(SavedFit { field: FitField::of_own(Arc::new(field)), state: Arc::new(state) })))
     }
 
+    fn measured(&mut self) -> Option<&mut dyn Measured> {
+        Some(self)
+    }
+}
+
+impl Measured for SaxTrainer {
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         SaxTrainer::profile_step(self)
-    }
-
-    fn as_any(&self) -> &dyn Any {
-        self
     }
 }

@@ -12,7 +12,7 @@ use crate::checkpoint::{self, Checkpoint};
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::files;
-use crate::fitting::fit::{AdjustTask, MadeGaussians, PreparedGaussians};
+use crate::fitting::fit::{AdjustTask, MadeFit, Start};
 use crate::fitting::losses::LargeLoss;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
@@ -77,7 +77,8 @@ pub fn reconstruct(
         files::write_atomic(&options.run.join(CONFIG), config.to_toml()?.as_bytes())?;
     }
     let max_buffer = u64::from(gpu.info().max_storage_buffer_range);
-    if let Some(memory) = methods::of(config).memory(config, dataset, max_buffer) {
+    let abilities = methods::of(config).abilities;
+    if let Some(memory) = abilities.estimate_memory.and_then(|estimate| estimate(config, dataset, max_buffer)) {
         let mib = |bytes: u64| bytes >> 20;
         observe(&Event::Memory {
             host_mib: mib(memory.host_bytes),
@@ -98,8 +99,8 @@ pub fn reconstruct(
         if let Some(hull) = &plan.hull {
             hull_pictures::write(&options.run.join("report"), dataset, hull)?;
         }
-        let gaussians = PreparedGaussians { made: made.as_ref(), shown: None };
-        Trainer::prepared(gpu, plan, dataset, options.tuning.clone(), gaussians)?
+        let from = Start { made: made.as_ref(), ..Start::default() };
+        Trainer::begin(gpu, plan, dataset, options.tuning.clone(), from)?
     };
     let config = trainer.plan().config.clone();
     files::write_atomic(&options.run.join(CONFIG), config.to_toml()?.as_bytes())?;
@@ -172,8 +173,8 @@ struct Calibrated {
     /// Rigid motion of the reconstruction against the truth, where that is known.
     carried: Option<RigidMotion>,
     calibration: Calibration,
-    /// Fit of Gaussians that the adjustment of views has left.
-    made: Option<MadeGaussians>,
+    /// Fit that the adjustment of views has left.
+    made: Option<MadeFit>,
 }
 
 /// Returns the dataset with the geometry of the run: calibrated now, or when the run was begun.
@@ -200,7 +201,8 @@ fn calibrated(
             }
             Ok(())
         };
-        if let Some(outcome) = methods::of(config).adjust(&task, &mut observe)? {
+        let adjust = methods::of(config).abilities.adjust_views;
+        if let Some(outcome) = adjust.map_or(Ok(None), |adjust| adjust(&task, &mut observe))? {
             calibration = adjusted(dataset, calibration, outcome.adjusted)?;
             made = outcome.made;
         }

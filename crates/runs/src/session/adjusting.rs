@@ -3,7 +3,7 @@
 use crate::calibrate::adjusted;
 use crate::calibrate::correction::Calibration;
 use crate::error::Result;
-use crate::fitting::fit::{AdjustTask, AdjustedFit, MadeGaussians};
+use crate::fitting::fit::{AdjustTask, AdjustedFit, MadeFit};
 use crate::methods;
 
 /// Outcome of the adjustment of a session's views.
@@ -12,7 +12,7 @@ pub(super) struct AdjustedViews {
     /// Whether the calibration of views has changed.
     pub(super) are_corrected: bool,
     /// Fit to these views; none where it was made with coarser images, or no adjustment was tried.
-    pub(super) made: Option<MadeGaussians>,
+    pub(super) made: Option<MadeFit>,
 }
 
 /// Adjusts views, and logs the progress. `proceed` is called before every few iterations and may end the adjustment by an error.
@@ -31,7 +31,9 @@ pub(super) fn adjust(task: &AdjustTask<'_>, proceed: &dyn Fn() -> Result<()>) ->
         Ok(())
     };
     let calibration = task.calibration.clone();
-    let Some(AdjustedFit { adjusted: outcome, made }) = methods::of(task.config).adjust(task, &mut observe)? else {
+    let adjust = methods::of(task.config).abilities.adjust_views;
+    let outcome = adjust.map_or(Ok(None), |adjust| adjust(task, &mut observe))?;
+    let Some(AdjustedFit { adjusted: outcome, made }) = outcome else {
         return Ok(AdjustedViews { calibration, are_corrected: false, made: None });
     };
     tracing::info!("{}", outcome.record.describe());

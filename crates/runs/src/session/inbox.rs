@@ -3,6 +3,7 @@
 use crate::config::{Config, DynamicTarget};
 use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT};
+use crate::methods;
 use crate::scan::at_rest;
 use crate::scan::canvas::onto_canvas;
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
@@ -327,9 +328,9 @@ impl Inbox {
     /// Returns the configuration of training while frames may arrive.
     pub(super) fn training_config(&self) -> Config {
         let mut config = self.options.config.clone();
-        if config.gaussians.fits == 0 {
+        if let Some(repeats) = methods::of(&config).abilities.repeat_fits {
             // Pictures are wanted while frames arrive, and a mean of fits cannot go on with new ones.
-            config.gaussians.fits = 1;
+            (repeats.only_one)(&mut config);
         }
         config
     }

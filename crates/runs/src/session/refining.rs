@@ -2,7 +2,7 @@
 
 use crate::calibrate::correction::Calibration;
 use crate::error::{Error, Result};
-use crate::fitting::fit::{AdjustTask, PreparedGaussians};
+use crate::fitting::fit::{AdjustTask, FitField, Start, Use};
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
 use crate::plan::Plan;
@@ -71,9 +71,9 @@ impl Shared {
         }
         engine.training = None;
         self.free_fields();
-        let shown = engine.saved.as_ref().and_then(|saved| saved.model.gaussians.as_ref());
-        let gaussians = PreparedGaussians { made: made.as_ref(), shown };
-        let trainer = Trainer::prepared(gpu, plan, &dataset, tuning, gaussians)?;
+        let shown = engine.saved.as_ref().and_then(|saved| saved.model.gaussians.clone()).map(FitField::of_gaussians);
+        let field = shown.as_ref().map(|shown| (shown, Use::Show));
+        let trainer = Trainer::begin(gpu, plan, &dataset, tuning, Start { field, state: None, made: made.as_ref() })?;
         trainer.plan().notes.iter().for_each(|note| tracing::info!("{note}"));
         engine.refined = version;
         *lock(&self.calibration) = Some(calibration);

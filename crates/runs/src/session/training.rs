@@ -2,6 +2,7 @@
 
 use crate::calibrate::calibrate;
 use crate::error::{Error, Result};
+use crate::fitting::fit::{FitField, Start, Use};
 use crate::methods;
 use crate::model::Model;
 use crate::model::scene::Scene;
@@ -65,16 +66,19 @@ impl Shared {
                 tracing::warn!(
                     "new frames show vessels outside the box that was trained so far, so training starts again"
                 );
-                earlier = state.model.gaussians.take();
+                earlier = state.model.gaussians.take().map(FitField::of_gaussians);
             }
             engine.saved = fits.then_some(state);
         }
         (engine.training, engine.version) = (None, 0); // its memory is needed
         self.free_fields();
         let trainer = match &engine.saved {
-            None => Trainer::start_over(gpu, fresh, &dataset, tuning, earlier.as_ref())?,
+            None => {
+                let field = earlier.as_ref().map(|earlier| (earlier, Use::GoOn));
+                Trainer::begin(gpu, fresh, &dataset, tuning, Start { field, ..Start::default() })?
+            }
             Some(state) => {
-                let plan = if methods::of(&config).boxes_hold_all_rays() {
+                let plan = if methods::of(&config).boxes_hold_all_rays {
                     fresh
                 } else {
                     fresh.in_scene(state.model.scene.clone())
@@ -307,7 +311,7 @@ fn holds(model: &Model, new: &Scene) -> bool {
     let slack = 0.02 * (0..3).map(|i| old.dynamic_max[i] - old.dynamic_min[i]).fold(0.0, f64::max);
     let within =
         |i: usize| new.dynamic_min[i] >= old.dynamic_min[i] - slack && new.dynamic_max[i] <= old.dynamic_max[i] + slack;
-    let inside = methods::of(&model.config).boxes_hold_all_rays() || (0..3).all(within);
+    let inside = methods::of(&model.config).boxes_hold_all_rays || (0..3).all(within);
     let alike = |a: f64, b: f64| a / b < 2.0 && b / a < 2.0;
     let static_alike = old.static_gain == new.static_gain || alike(old.static_gain, new.static_gain);
     inside && static_alike && alike(old.dynamic_gain, new.dynamic_gain)
