@@ -17,10 +17,12 @@ use std::{env, fs};
 
 type Failure = Box<dyn std::error::Error>;
 
-/// Includes whose structures the host uses as well.
-const SHARED_STRUCTURES: [&str; 5] = ["layout", "gaussian_layout", "r2_layout", "sax_layout", "x_layout"];
-/// Includes whose integer constants the host uses as well.
-const SHARED_CONSTANTS: [&str; 6] = ["layout", "lineformer_layout", "occupancy", "positions", "random", "sample_rays"];
+/// End of the names of includes whose structures and integer constants the host uses as well.
+const SHARED: &str = "layout.glsl";
+/// Other includes whose integer constants the host uses as well.
+const SHARED_CONSTANTS: [&str; 3] = ["occupancy.glsl", "positions.glsl", "sample_rays.glsl"];
+/// Include whose integer constants stand in a file of their own.
+const RANDOM: &str = "random.glsl";
 
 fn main() -> Result<(), Failure> {
     println!("cargo:rerun-if-changed=build");
@@ -47,19 +49,27 @@ fn write_shaders(glsl: &Path, out: &Path) -> Result<(), Failure> {
         fs::write(out.join(format!("{}.spv", kernel.name)), &kernel.shipped)?;
         kernels.push((kernel, reflected));
     }
-    let include = |name: &str| fs::read_to_string(glsl.join(format!("inc/{name}.glsl")));
     fs::write(out.join("table.rs"), generate::table(&kernels, out))?;
-    let mut comments = source::Comments::new();
-    for name in SHARED_STRUCTURES {
-        comments.extend(source::comments(&include(name)?));
+    let (mut comments, mut constants) = (source::Comments::new(), Vec::new());
+    let mut includes = compile::entries(&glsl.join("inc"))?;
+    includes.sort();
+    for path in includes {
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        let text = fs::read_to_string(&path)?;
+        if name.ends_with(SHARED) {
+            comments.extend(source::comments(&text));
+        }
+        if name.ends_with(SHARED) || SHARED_CONSTANTS.contains(&name) {
+            constants.extend(source::constants(&text));
+        }
+        if name == RANDOM {
+            fs::write(out.join("random.rs"), generate::constants(&source::constants(&text)))?;
+        }
     }
+    fs::write(out.join("constants.rs"), generate::constants(&constants))?;
     fs::write(out.join("layout.rs"), generate::layout(&kernels, &comments)?)?;
     fs::write(out.join("push.rs"), generate::push(&kernels)?)?;
     fs::write(out.join("bindings.rs"), generate::bindings(&kernels))?;
     fs::write(out.join("numbers.rs"), generate::numbers(&numbers))?;
-    for name in SHARED_CONSTANTS {
-        let constants = source::constants(&include(name)?);
-        fs::write(out.join(format!("constants_{name}.rs")), generate::constants(&constants))?;
-    }
     Ok(())
 }

@@ -44,14 +44,16 @@ fn knows_matrices(compiler: &shaderc::Compiler) -> Result<bool, Failure> {
     Ok(probe.is_ok())
 }
 
+/// Lists the files and folders in a folder.
+pub fn entries(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
+    Ok(fs::read_dir(folder)?.filter_map(|entry| entry.ok().map(|e| e.path())).collect())
+}
+
 /// Compiles every shader and every variant; shaders in the order of their names.
 pub fn kernels(glsl: &Path) -> Result<Vec<Kernel>, Failure> {
     let variants = read_variants(&glsl.join("variants.txt"))?;
     let compiler = shaderc::Compiler::new()?;
     let knows_matrices = knows_matrices(&compiler)?;
-    let entries = |folder: &Path| -> Result<Vec<PathBuf>, Failure> {
-        Ok(fs::read_dir(folder)?.filter_map(|entry| entry.ok().map(|e| e.path())).collect())
-    };
     let mut sources = Vec::new();
     for folder in entries(glsl)?.into_iter().filter(|path| path.is_dir()) {
         sources.extend(entries(&folder)?.into_iter().filter(|path| path.extension().is_some_and(|e| e == "comp")));

@@ -102,7 +102,6 @@ pub mod gaussians {
     pub mod blobs;
     pub mod comparison;
     pub mod field;
-    mod mean;
     pub mod particles;
     pub mod pictures;
     pub mod spacing;

@@ -1,15 +1,13 @@
 //! A reconstruction: parameters with everything needed to evaluate them, independent of any dataset.
 
 pub mod component;
-mod conversions;
 pub mod field;
-pub mod groups;
 pub mod hull;
 pub mod params;
 pub mod scene;
 
 use crate::config::Config;
-use crate::gaussians::field::DynamicGaussians;
+use crate::gaussians::field::GaussianField;
 use crate::geometry::CArm;
 use crate::model::field::Field;
 use crate::model::hull::Hull;
@@ -29,7 +27,7 @@ pub struct Model {
     /// Motion hull, when the run uses one.
     pub hull: Option<Hull>,
     /// Gaussians, where they are the dynamic field; none where it is the network.
-    pub gaussians: Option<DynamicGaussians>,
+    pub gaussians: Option<GaussianField>,
     /// Field of a method with a module of its own ([`crate::methods`]); the model then has no other field.
     pub field: Option<Arc<dyn Field>>,
     /// Parameters, padded as [`ParamMap`] says.
@@ -53,6 +51,6 @@ impl Model {
     /// Tells whether the dynamic field has values between phases, as a network or one moving set of Gaussians has. Sets per
     /// phase and fields of methods with a module of their own have none.
     pub fn is_continuous(&self) -> bool {
-        self.field.is_none() && self.gaussians.as_ref().is_none_or(|field| field.deformable().is_some())
+        self.field.is_none() && self.gaussians.as_ref().is_none_or(|field| field.moving().is_some())
     }
 }

@@ -11,7 +11,7 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_gaussians; uint first_phase; uint n_phases; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) uniform B1 { DeformableSetup deformable_setup; };
+layout(binding = 1) uniform B1 { MotionGridSetup deformable_setup; };
 layout(binding = 2) readonly buffer B2 { Gaussian gaussians[]; };
 layout(binding = 3) readonly buffer B3 { vec4 place_gradient[]; };
 layout(binding = 4) readonly buffer B4 { vec4 motion_grid[]; };

@@ -6,7 +6,7 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint first_phase; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) uniform B1 { DeformableSetup deformable_setup; };
+layout(binding = 1) uniform B1 { MotionGridSetup deformable_setup; };
 layout(binding = 2) readonly buffer B2 { GaussianSchedule gaussian_schedule[]; };
 layout(binding = 3) readonly buffer B3 { uint gaussian_step; };
 layout(binding = 4) readonly buffer B4 { vec4 motion_grid_gradient[]; };

@@ -6,7 +6,7 @@
 #include "inc/deformable_grid.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint phase; uint before; uint before_that; } push;
-layout(binding = 0) uniform B0 { DeformableSetup deformable_setup; };
+layout(binding = 0) uniform B0 { MotionGridSetup deformable_setup; };
 layout(binding = 1) buffer B1 { vec4 motion_grid[]; };
 
 void main() {

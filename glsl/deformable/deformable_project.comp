@@ -7,7 +7,7 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_gaussians; uint first_phase; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) uniform B1 { DeformableSetup deformable_setup; };
+layout(binding = 1) uniform B1 { MotionGridSetup deformable_setup; };
 layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
 layout(binding = 3) readonly buffer B3 { Gaussian gaussians[]; };
 // [phase][node]: displacement; zero at the rest phase.

@@ -6,16 +6,16 @@
 // those of the window. The loss of each set is the mean of |x - y| + ssim_weight (1 - v). One invocation per pixel (x) and set
 // (y).
 #include "inc/gaussian_layout.glsl"
-#include "inc/r2_layout.glsl"
+#include "inc/picture_layout.glsl"
 #include "inc/ssim.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) uniform B1 { R2Setup r2_setup; };
-layout(binding = 2) readonly buffer B2 { R2Turn r2_turns[]; };
+layout(binding = 1) uniform B1 { PictureSetup picture_setup; };
+layout(binding = 2) readonly buffer B2 { PictureTurn picture_turns[]; };
 layout(binding = 3) readonly buffer B3 { uint gaussian_step; };
 layout(binding = 4) readonly buffer B4 { int splat_images[]; };
-layout(binding = 5) readonly buffer B5 { float r2_targets[]; };
+layout(binding = 5) readonly buffer B5 { float picture_targets[]; };
 layout(binding = 6) readonly buffer B6 { vec4 ssim_row_sums[]; };
 layout(binding = 7) readonly buffer B7 { float ssim_row_products[]; };
 // [set][pixel]: P, Q, T and v.
@@ -43,8 +43,8 @@ float compare(uint p, uint set) {
     ssim_factors[picture] =
         vec4(2.0 * m2 * (a2 - a1) * both + 2.0 * m1 * v * (1.0 / b2 - 1.0 / b1), -v / b2, 2.0 * a1 * both, v);
     float x = float(splat_images[picture]) / gaussian_setup.fixed_point;
-    float y = r2_targets[r2_turns[gaussian_step * r2_setup.n_sets + set].image * stride + p];
-    return abs(x - y) + r2_setup.ssim_weight * (1.0 - v);
+    float y = picture_targets[picture_turns[gaussian_step * picture_setup.n_sets + set].image * stride + p];
+    return abs(x - y) + picture_setup.ssim_weight * (1.0 - v);
 }
 
 void main() {

@@ -2,7 +2,7 @@
 // free values at each phase, and by harmonics of its own. Reference implementation: crates/twins/src/reference/dynamic_gaussians.rs.
 
 // Position on the grid, in node distances from its first node.
-vec3 on_grid(vec3 position, DeformableSetup deformable) {
+vec3 on_grid(vec3 position, MotionGridSetup deformable) {
     float last = float(deformable.n_nodes) - 1.001;
     return clamp((position + deformable.half_side) * deformable.inverse_step, vec3(0.0), vec3(last));
 }
@@ -13,6 +13,6 @@ float node_share(vec3 place, uvec3 node) {
     return w.x * w.y * w.z;
 }
 
-uint node_index(uvec3 node, DeformableSetup deformable) {
+uint node_index(uvec3 node, MotionGridSetup deformable) {
     return (node.z * deformable.n_nodes + node.y) * deformable.n_nodes + node.x;
 }

@@ -55,7 +55,7 @@ struct GaussianSchedule {
 };
 
 // Displacement grid of a deformable set of Gaussians, and the regularisation of its motion.
-struct DeformableSetup {
+struct MotionGridSetup {
     uint n_nodes;               // Number of nodes along each axis of a cube around the isocentre.
     float half_side;            // Half side of the cube, pixels.
     float inverse_step;         // Number of node distances per pixel.

@@ -3,6 +3,7 @@
 #include "inc/gaussian.glsl"
 #include "inc/gaussian_gradient.glsl"
 #include "inc/local_projection.glsl"
+#include "inc/picture_layout.glsl"
 #include "inc/r2_layout.glsl"
 #include "inc/softplus.glsl"
 

@@ -16,7 +16,6 @@ struct R2Setup {
     uint n_sets;                // Number of sets of Gaussians, each fitted separately.
     uint box_side;              // Number of voxels along each side of the box whose total variation counts.
     float voxel;                // Side of a voxel.
-    float ssim_weight;          // Weight of 1 - SSIM.
     float tv_weight;            // Weight of the total variation.
     uint tv_moves_centres;      // Flag: 1 if the gradient of the total variation includes the centres.
     uint exact;                 // Flag: 1 for line integrals along pixels' own rays, 0 for those of the affine picture.
@@ -31,10 +30,4 @@ struct R2Schedule {
     float bias1;                // Bias correction 1 - beta1^t after t updates, including this one.
     float bias2;                // Bias correction 1 - beta2^t.
     uint updates;               // Flag: 0 if Gaussians are added and pruned after this iteration and no parameter is updated.
-};
-
-// Image and box of a set in an iteration.
-struct R2Turn {
-    vec3 corner;                // Centre of the first voxel of the box.
-    uint image;                 // Index of the training image.
 };

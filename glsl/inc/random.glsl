@@ -26,9 +26,9 @@ const uint STREAM_PLACE = 8u;         // selection of the cells of the hull in w
 const uint STREAM_JITTER = 9u;        // position in its cell at which a Gaussian begins
 const uint STREAM_ACQUISITION = 10u;  // acquisition of the runs of phantoms
 const uint STREAM_SET_IMAGE = 11u;    // order of the images of a set of a static method of Gaussians
-const uint STREAM_R2_BOX = 12u;       // position of the box of voxels whose total variation counts
-const uint STREAM_R2_CHILD = 13u;     // positions of the children of a Gaussian that is split
-const uint STREAM_SAX_WINDOW = 14u;   // selection of the windows of an image in SAX-NeRF
+const uint STREAM_BOX = 12u;       // position of the box of voxels whose total variation counts
+const uint STREAM_CHILD = 13u;     // positions of the children of a Gaussian that is split
+const uint STREAM_WINDOW = 14u;   // selection of the windows of an image in SAX-NeRF
 
 // Uniform random number in [0, 1) with 24 bits.
 float uniform01(uint seed, uint stream, uint a, uint b) {

@@ -11,7 +11,7 @@ layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) uniform B1 { R2Setup r2_setup; };
 layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
 layout(binding = 3) readonly buffer B3 { R2Gaussian r2_gaussians[]; };
-layout(binding = 4) readonly buffer B4 { R2Turn r2_turns[]; };
+layout(binding = 4) readonly buffer B4 { PictureTurn picture_turns[]; };
 layout(binding = 5) readonly buffer B5 { uint gaussian_step; };
 layout(binding = 6) readonly buffer B6 { Splat splats[]; };
 // [set][row][column] in fixed point; image_stride numbers per picture.
@@ -21,7 +21,7 @@ void main() {
     uint i = splat_index();
     if (i >= push.n_gaussians) return;
     R2Gaussian g = r2_gaussians[i];
-    GaussianView view = gaussian_views[r2_turns[gaussian_step * r2_setup.n_sets + g.set].image];
+    GaussianView view = gaussian_views[picture_turns[gaussian_step * r2_setup.n_sets + g.set].image];
     Splat s = splats[i];
     R2Sight sight = sight_of(g, s.mean, view, gaussian_setup);
     uint first = g.set * gaussian_setup.image_stride;

@@ -12,7 +12,7 @@ layout(binding = 1) uniform B1 { R2Setup r2_setup; };
 layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
 layout(binding = 3) readonly buffer B3 { R2Gaussian r2_gaussians[]; };
 // [iteration][set]
-layout(binding = 4) readonly buffer B4 { R2Turn r2_turns[]; };
+layout(binding = 4) readonly buffer B4 { PictureTurn picture_turns[]; };
 layout(binding = 5) readonly buffer B5 { uint gaussian_step; };
 layout(binding = 6) writeonly buffer B6 { Splat splats[]; };
 // Picture of each splat; there is one picture per set.
@@ -22,7 +22,7 @@ void main() {
     uint i = invocation();
     if (i >= push.n_gaussians) return;
     R2Gaussian g = r2_gaussians[i];
-    R2Turn turn = r2_turns[gaussian_step * r2_setup.n_sets + g.set];
+    PictureTurn turn = picture_turns[gaussian_step * r2_setup.n_sets + g.set];
     GaussianView view = gaussian_views[turn.image];
     R2Projection p = project_r2(g, view, gaussian_setup);
     if (r2_setup.exact != 0u && p.at.depth > 0.0) p.splat.half_box = chord_box(p, view, gaussian_setup);

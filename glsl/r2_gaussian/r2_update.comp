@@ -10,7 +10,7 @@ layout(push_constant) uniform Push { uint n_gaussians; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) uniform B1 { R2Setup r2_setup; };
 layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
-layout(binding = 3) readonly buffer B3 { R2Turn r2_turns[]; };
+layout(binding = 3) readonly buffer B3 { PictureTurn picture_turns[]; };
 layout(binding = 4) readonly buffer B4 { R2Schedule r2_schedule[]; };
 layout(binding = 5) readonly buffer B5 { uint gaussian_step; };
 // [Gaussian][2] of gaussian_moments, or [Gaussian][3] of r2_chord_moments.
@@ -76,7 +76,7 @@ void main() {
     if (i >= push.n_gaussians) return;
     R2Schedule now = r2_schedule[gaussian_step];
     R2Gaussian g = r2_gaussians[i];
-    GaussianView view = gaussian_views[r2_turns[gaussian_step * r2_setup.n_sets + g.set].image];
+    GaussianView view = gaussian_views[picture_turns[gaussian_step * r2_setup.n_sets + g.set].image];
     R2Projection p = project_r2(g, view, gaussian_setup);
     GaussianGradient sum = no_gradient();
     if (n_pixels(pixels_of(splats[i], gaussian_setup)) > 0u) {

@@ -10,7 +10,7 @@ layout(push_constant) uniform Push { uint n_gaussians; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) uniform B1 { R2Setup r2_setup; };
 layout(binding = 2) readonly buffer B2 { R2Gaussian r2_gaussians[]; };
-layout(binding = 3) readonly buffer B3 { R2Turn r2_turns[]; };
+layout(binding = 3) readonly buffer B3 { PictureTurn picture_turns[]; };
 layout(binding = 4) readonly buffer B4 { uint gaussian_step; };
 // [set][z][y][x] in fixed point.
 layout(binding = 5) buffer B5 { int r2_voxel_sums[]; };
@@ -19,7 +19,7 @@ void main() {
     uint i = splat_index();
     if (i >= push.n_gaussians) return;
     R2Gaussian g = r2_gaussians[i];
-    vec3 corner = r2_turns[gaussian_step * r2_setup.n_sets + g.set].corner;
+    vec3 corner = picture_turns[gaussian_step * r2_setup.n_sets + g.set].corner;
     vec3 scale = scale_of(g, gaussian_setup);
     R2Voxels near = voxels_of(g, scale, corner, r2_setup);
     uint n = n_voxels(near);

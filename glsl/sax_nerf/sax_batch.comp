@@ -23,7 +23,7 @@ uint columns() { return sax_setup.width / sax_setup.window; }
 // Tile of the image that is the `k`-th window.
 uint tile_of(uint k) {
     uint n_tiles = columns() * (sax_setup.height / sax_setup.window);
-    return permute(k, n_tiles, push.seed, state.step, STREAM_SAX_WINDOW);
+    return permute(k, n_tiles, push.seed, state.step, STREAM_WINDOW);
 }
 
 uint pixel_of_window(uint ray) {

@@ -4,22 +4,22 @@
 // the first. Here g is the gradient with respect to the picture, T the transmittance in front of a Gaussian, a its opacity, c
 // its intensity and B the value of the picture behind it. With h = g T (c - B) a where a depends on the parameters, the sums
 // are those of h, h (du, dv), h (du^2, du dv, dv^2) and g T a. One workgroup per tile column (x), row (y) and set (z).
-#include "inc/x_gaussian.glsl"
+#include "inc/blend.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) uniform B1 { XSetup x_setup; };
-layout(binding = 2) readonly buffer B2 { XGaussian x_gaussians[]; };
+layout(binding = 1) uniform B1 { BlendSetup blend_setup; };
+layout(binding = 2) readonly buffer B2 { BlendGaussian blend_gaussians[]; };
 layout(binding = 3) readonly buffer B3 { Splat splats[]; };
-layout(binding = 4) readonly buffer B4 { XSpan x_spans[]; };
+layout(binding = 4) readonly buffer B4 { BlendSpan blend_spans[]; };
 // [set][tile row][tile column]
-layout(binding = 5) readonly buffer B5 { XList x_lists[]; };
-layout(binding = 6) readonly buffer B6 { uint x_list_items[]; };
+layout(binding = 5) readonly buffer B5 { BlendList blend_lists[]; };
+layout(binding = 6) readonly buffer B6 { uint blend_list_items[]; };
 // [set][pixel]
-layout(binding = 7) readonly buffer B7 { XEnd x_ends[]; };
+layout(binding = 7) readonly buffer B7 { BlendEnd blend_ends[]; };
 layout(binding = 8) readonly buffer B8 { float splat_image_gradient[]; };
 // [entry][7 sums]
 layout(binding = 9) writeonly buffer B9 { float x_entries[]; };
-#include "inc/x_tile.glsl"
+#include "inc/blend_tile.glsl"
 
 // Number of Gaussians whose sums are computed at once.
 const uint BATCH = 8u;
@@ -48,20 +48,20 @@ Pixel pixel_to_go_back(uint k) {
     uvec2 pixel = pixel_of_lane(k);
     if (!is_in_image(pixel)) return Pixel(vec2(0.0), 0.0, 1.0, 0.0, 0u);
     uint place = place_of(pixel);
-    float gradient = x_setup.absolute_weight * splat_image_gradient[place];
-    return Pixel(vec2(pixel), gradient, x_ends[place].left, 0.0, x_ends[place].last);
+    float gradient = blend_setup.absolute_weight * splat_image_gradient[place];
+    return Pixel(vec2(pixel), gradient, blend_ends[place].left, 0.0, blend_ends[place].last);
 }
 
 uint entry_of(uint i) {
-    XSpan span = x_spans[i];
+    BlendSpan span = blend_spans[i];
     uvec2 from_first = gl_WorkGroupID.xy - uvec2(span.first & 0xffffu, span.first >> 16);
     return span.first_entry + from_first.y * columns_and_rows(span).x + from_first.x;
 }
 
 // Writes zeros for the Gaussians behind the last visible one, which do not contribute.
-void clear_hidden(XList list) {
+void clear_hidden(BlendList list) {
     for (uint k = last_shown + gl_LocalInvocationID.x; k < list.count; k += LANES) {
-        uint entry = entry_of(x_list_items[list.first + k]);
+        uint entry = entry_of(blend_list_items[list.first + k]);
         for (uint s = 0u; s < SUMS; s++) x_entries[entry * SUMS + s] = 0.0;
     }
 }
@@ -88,7 +88,7 @@ void pass(uint j, inout Pixel pixel, inout float sums[SUMS]) {
 
 void main() {
     uint lane = gl_LocalInvocationID.x;
-    XList list = x_lists[list_of_workgroup()];
+    BlendList list = blend_lists[list_of_workgroup()];
     if (lane == 0u) last_shown = 0u;
     barrier();
     Pixel pixels[PIXELS_OF_LANE];
@@ -101,8 +101,8 @@ void main() {
     for (uint batch = (last_shown + BATCH - 1u) / BATCH; batch-- > 0u;) {
         uint begin = batch * BATCH, n = min(BATCH, last_shown - begin);
         if (lane < n) {
-            uint i = x_list_items[list.first + begin + lane];
-            places[lane] = vec4(splats[i].mean, splats[i].amplitude, max(x_gaussians[i].intensity, 0.0));
+            uint i = blend_list_items[list.first + begin + lane];
+            places[lane] = vec4(splats[i].mean, splats[i].amplitude, max(blend_gaussians[i].intensity, 0.0));
             conics[lane] = splats[i].conic;
             entries[lane] = entry_of(i);
         }

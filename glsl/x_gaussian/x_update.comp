@@ -3,22 +3,23 @@
 // Gradient of each Gaussian of X-Gaussian with respect to its stored numbers, from its sums in the tiles in which it is
 // visible, in their order; the statistics of density control; and Adam's update. The kernel does nothing if the lists exceeded
 // the capacity. One invocation per Gaussian.
-#include "inc/x_gaussian.glsl"
+#include "inc/blend.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
+#include "inc/x_layout.glsl"
 layout(push_constant) uniform Push { uint n_gaussians; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) uniform B1 { XSetup x_setup; };
+layout(binding = 1) uniform B1 { BlendSetup blend_setup; };
 layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
-layout(binding = 3) readonly buffer B3 { uint x_set_of[]; };
-layout(binding = 4) readonly buffer B4 { R2Turn r2_turns[]; };
+layout(binding = 3) readonly buffer B3 { uint blend_set_of[]; };
+layout(binding = 4) readonly buffer B4 { PictureTurn picture_turns[]; };
 layout(binding = 5) readonly buffer B5 { XSchedule x_schedule[]; };
 layout(binding = 6) readonly buffer B6 { uint gaussian_step; };
-layout(binding = 7) readonly buffer B7 { XSpan x_spans[]; };
-layout(binding = 8) readonly buffer B8 { XCounts x_counts; };
+layout(binding = 7) readonly buffer B7 { BlendSpan blend_spans[]; };
+layout(binding = 8) readonly buffer B8 { BlendCounts blend_counts; };
 // [entry][7 sums]
 layout(binding = 9) readonly buffer B9 { float x_entries[]; };
-layout(binding = 10) buffer B10 { XGaussian x_gaussians[]; };
+layout(binding = 10) buffer B10 { BlendGaussian blend_gaussians[]; };
 // First and second moments of Adam, in the layout of the Gaussians: position and opacity, scale and intensity, rotation.
 layout(binding = 11) buffer B11 { vec4 gaussian_adam_first[]; };
 layout(binding = 12) buffer B12 { vec4 gaussian_adam_second[]; };
@@ -39,10 +40,10 @@ vec4 step_of(uint at, vec4 g, vec4 rate, XSchedule now) {
 
 void main() {
     uint i = invocation();
-    if (i >= push.n_gaussians || x_counts.entries > x_setup.capacity) return;
+    if (i >= push.n_gaussians || blend_counts.entries > blend_setup.capacity) return;
     XSchedule now = x_schedule[gaussian_step];
-    XGaussian g = x_gaussians[i];
-    XSpan span = x_spans[i];
+    BlendGaussian g = blend_gaussians[i];
+    BlendSpan span = blend_spans[i];
     uvec2 tiles = columns_and_rows(span);
     uint n = tiles.x * tiles.y;
     GaussianGradient sum = no_gradient();
@@ -54,8 +55,8 @@ void main() {
             square += vec3(x_entries[k + 3u], x_entries[k + 4u], x_entries[k + 5u]);
             by_intensity += x_entries[k + 6u];
         }
-        GaussianView view = gaussian_views[r2_turns[gaussian_step * x_setup.n_sets + x_set_of[i]].image];
-        XProjection p = project_x(g, view, gaussian_setup, x_setup);
+        GaussianView view = gaussian_views[picture_turns[gaussian_step * blend_setup.n_sets + blend_set_of[i]].image];
+        BlendProjection p = project_blended(g, view, gaussian_setup, blend_setup);
         sum = gradient_x(g, p, view, linear, square);
         if (!(g.intensity > 0.0)) by_intensity = 0.0;
         vec2 half_image = 0.5 * vec2(float(gaussian_setup.width), float(gaussian_setup.height));
@@ -70,9 +71,9 @@ void main() {
     vec4 scale_rate = vec4(vec3(now.scale_rate), now.intensity_rate);
     vec4 grown = step_of(3u * i + 1u, vec4(sum.log_scale, by_intensity), scale_rate, now);
     vec4 turned = step_of(3u * i + 2u, sum.rotation, vec4(now.rotation_rate), now);
-    x_gaussians[i].position = g.position - moved.xyz;
-    x_gaussians[i].opacity = g.opacity - moved.w;
-    x_gaussians[i].log_scale = g.log_scale - grown.xyz;
-    x_gaussians[i].intensity = g.intensity - grown.w;
-    x_gaussians[i].rotation = g.rotation - turned;
+    blend_gaussians[i].position = g.position - moved.xyz;
+    blend_gaussians[i].opacity = g.opacity - moved.w;
+    blend_gaussians[i].log_scale = g.log_scale - grown.xyz;
+    blend_gaussians[i].intensity = g.intensity - grown.w;
+    blend_gaussians[i].rotation = g.rotation - turned;
 }

@@ -4,15 +4,13 @@
 //! Projections do not show motion along a vessel; that part of the exported motion comes from the smoothness of the grid alone.
 //! So no strain is exported, and none should be derived.
 
-use crate::choice::Choice;
-use crate::config::GaussianForm;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::nrrd::{self, Encoding};
 use crate::formats::raw::{self, ByteOrder};
 use crate::formats::volume::VolumeHeader;
 use crate::formats::vtk::{self, Lines, PointValues};
-use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, scales};
+use crate::gaussians::field::{GaussianField, MovingGaussians, scales};
 use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::Gaussian;
 use crate::model::Model;
@@ -49,16 +47,14 @@ impl MotionFormat {
 /// # Errors
 /// [`Error::Config`] where the dynamic field is one set of Gaussians per phase or a network, because neither follows a point
 /// over time.
-pub fn deformable_set(model: &Model) -> Result<&DeformableGaussians> {
-    let form = model.gaussians.as_ref().map_or(GaussianForm::None, DynamicGaussians::form);
-    model.gaussians.as_ref().and_then(DynamicGaussians::deformable).ok_or_else(|| {
-        let made_of = match form {
-            GaussianForm::None => "a network",
-            _ => "a set of Gaussians per phase",
-        };
+pub fn moving_set(model: &Model) -> Result<&MovingGaussians> {
+    let field = model.gaussians.as_ref();
+    field.and_then(GaussianField::moving).ok_or_else(|| {
+        let (form, made_of) =
+            field.map_or(("none", "a network"), |field| (field.form(), "a set of Gaussians per phase"));
         Error::config(
             "gaussians.form",
-            form.name(),
+            form,
             format!(
                 "the dynamic field is {made_of}, which does not track points from phase to phase: train one deformable \
                  set of Gaussians (preset fast with gaussians.form = \"deformable\")"
@@ -68,14 +64,14 @@ pub fn deformable_set(model: &Model) -> Result<&DeformableGaussians> {
 }
 
 /// Converts a length or position along (posterior, left, superior) in the Gaussians' pixels to LPS mm.
-fn lps_mm(deformable: &DeformableGaussians, x: DVec3) -> DVec3 {
-    DVec3::new(x.y, x.x, x.z) * deformable.rest.units.pixel * MM_PER_UNIT
+fn lps_mm(moving: &MovingGaussians, x: DVec3) -> DVec3 {
+    DVec3::new(x.y, x.x, x.z) * moving.rest.units.pixel * MM_PER_UNIT
 }
 
 /// Export of the displacements on a deformable set's grid.
 pub struct MotionExport<'a> {
     /// The deformable set of Gaussians.
-    pub deformable: &'a DeformableGaussians,
+    pub moving: &'a MovingGaussians,
     /// Phases to export, from 0.
     pub phases: Vec<u32>,
     /// Whether a phase axis, or a number in each file name, is also written for a single phase.
@@ -94,7 +90,7 @@ impl MotionExport<'_> {
     /// # Errors
     /// [`Error::Config`] for a phase the model does not have, and for gzip in VTK; [`Error::Io`].
     pub fn write(&self, path: &Path) -> Result<Vec<PathBuf>> {
-        let n_phases = self.deformable.rest.n_phases;
+        let n_phases = self.moving.rest.n_phases;
         if let Some(bad) = self.phases.iter().find(|phase| **phase as usize >= n_phases) {
             return Err(Error::config("phase", bad, format!("is out of range: phases go from 0 to {}", n_phases - 1)));
         }
@@ -109,11 +105,11 @@ impl MotionExport<'_> {
 
     /// Header of a file with vectors on the grid.
     fn header(&self) -> VolumeHeader {
-        let setup = &self.deformable.setup;
+        let setup = &self.moving.setup;
         let (first, step) = (-f64::from(setup.half_side), 1.0 / f64::from(setup.inverse_step));
         VolumeHeader {
-            origin_mm: lps_mm(self.deformable, DVec3::splat(first)),
-            spacing_mm: lps_mm(self.deformable, DVec3::splat(step)),
+            origin_mm: lps_mm(self.moving, DVec3::splat(first)),
+            spacing_mm: lps_mm(self.moving, DVec3::splat(step)),
             size: [setup.n_nodes; 3],
             phases: self.sequence.then(|| self.phases.clone()),
             quantity: format!("displacement from phase {}, mm", setup.rest_phase),
@@ -122,11 +118,11 @@ impl MotionExport<'_> {
 
     /// Displacements at a phase in the order of the files.
     fn vectors(&self, phase: u32) -> Vec<f32> {
-        let n = self.deformable.setup.n_nodes as usize;
-        let nodes = &self.deformable.grid[phase as usize * n.pow(3)..][..n.pow(3)];
+        let n = self.moving.setup.n_nodes as usize;
+        let nodes = &self.moving.grid[phase as usize * n.pow(3)..][..n.pow(3)];
         // The grid's axes are (posterior, left, superior); the first varies fastest.
         let node = |i: usize| nodes[(i / (n * n) * n + i % n) * n + i / n % n];
-        let vector = |[x, y, z, _]: [f32; 4]| lps_mm(self.deformable, DVec3::new(x.into(), y.into(), z.into()));
+        let vector = |[x, y, z, _]: [f32; 4]| lps_mm(self.moving, DVec3::new(x.into(), y.into(), z.into()));
         (0..n.pow(3)).flat_map(|i| vector(node(i)).as_vec3().to_array()).collect()
     }
 
@@ -169,9 +165,9 @@ impl MotionExport<'_> {
 ///
 /// # Errors
 /// [`Error::Io`].
-pub fn write_trajectories(deformable: &DeformableGaussians, path: &Path) -> Result<()> {
-    let n_phases = deformable.rest.n_phases;
-    let units = deformable.rest.units;
+pub fn write_trajectories(moving: &MovingGaussians, path: &Path) -> Result<()> {
+    let n_phases = moving.rest.n_phases;
+    let units = moving.rest.units;
     let mut lines = Lines {
         title: format!("trajectories of Gaussians over a closed beat, LPS mm; {CAVEAT}"),
         points_per_line: n_phases,
@@ -180,15 +176,15 @@ pub fn write_trajectories(deformable: &DeformableGaussians, path: &Path) -> Resu
     };
     let (mut phases, mut scale_mm, mut attenuation) = (Vec::new(), Vec::new(), Vec::new());
     let deviations_mm = |g: &Gaussian| {
-        let mut sorted = (scales(g, &deformable.rest.setup) * units.pixel * MM_PER_UNIT).to_array();
+        let mut sorted = (scales(g, &moving.rest.setup) * units.pixel * MM_PER_UNIT).to_array();
         sorted.sort_by(f64::total_cmp);
         sorted.map(|v| v as f32)
     };
-    for (index, g) in deformable.rest.rows.iter().enumerate() {
+    for (index, g) in moving.rest.rows.iter().enumerate() {
         let scale = deviations_mm(g);
         let per_mm = f64::from(g.log_density).exp() * units.attenuation() / MM_PER_UNIT;
         for phase in 0..n_phases {
-            lines.points.push(lps_mm(deformable, deformable.position(index, phase as f64)).as_vec3().to_array());
+            lines.points.push(lps_mm(moving, moving.position(index, phase as f64)).as_vec3().to_array());
             phases.push(phase as f32);
             scale_mm.extend(scale);
             attenuation.push(per_mm as f32);

@@ -3,7 +3,7 @@
 use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::splats::{Splat, to_ply};
-use crate::gaussians::field::{DynamicGaussians, density, scales, vessel_density};
+use crate::gaussians::field::{GaussianField, density, scales, vessel_density};
 use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::Gaussian;
 use crate::model::Model;
@@ -19,7 +19,7 @@ const MIN_OPACITY: f64 = 1.0 / 255.0;
 
 /// Returns the Gaussians of a field at a phase. Attenuation has no opacity: a Gaussian as dense as the vessels is opaque, and others are so in
 /// proportion to their density. Gaussians that blend, as with X-Gaussian, keep their opacity and have their intensity as a grey.
-pub fn splats(field: &DynamicGaussians, phase: usize) -> Vec<Splat> {
+pub fn splats(field: &GaussianField, phase: usize) -> Vec<Splat> {
     let rows = field.rows();
     let mm = rows.units.pixel * MM_PER_UNIT;
     let blended = rows.blended_at(phase);

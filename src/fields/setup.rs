@@ -1,6 +1,5 @@
 //! The constants that shaders read, computed from a model.
 
-use crate::config::sections::Networks;
 use crate::config::{Config, DynamicTarget, OcclusionRegion, StaticForm};
 use crate::fitting::{FIXED_POINT_BITS, RING_LENGTH};
 use crate::kernels::layout::Setup;
@@ -28,7 +27,7 @@ impl Scene {
         self.set_occupancy(&mut setup, config);
         set_optimiser(&mut setup, config);
         if config.static_field.form == StaticForm::Network {
-            set_networks(&mut setup, &config.networks);
+            set_networks(&mut setup, config);
         }
         setup
     }
@@ -110,7 +109,8 @@ fn shape_fields(setup: &mut Setup, config: &Config, params: &ParamMap) {
 }
 
 /// Sets the constants of the losses of two networks that have no schedule.
-fn set_networks(setup: &mut Setup, networks: &Networks) {
+fn set_networks(setup: &mut Setup, config: &Config) {
+    let networks = &config.networks;
     setup.two_networks = 1;
     setup.change_weight = networks.change_weight as f32;
     setup.min_change = networks.min_change as f32;

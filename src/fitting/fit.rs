@@ -8,7 +8,7 @@ use crate::config::method::MethodKind;
 use crate::error::{Error, Result};
 use crate::fitting::ledger::Ledger;
 use crate::fitting::losses::StepLoss;
-use crate::gaussians::field::{DynamicGaussians, GaussianFeed};
+use crate::gaussians::field::{GaussianFeed, GaussianField};
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
@@ -157,14 +157,14 @@ pub struct FitField {
     /// Motion hull that bounds the dynamic field, if there is one.
     pub hull: Option<Hull>,
     /// Gaussians, which are drawn and exported alike for all methods.
-    pub gaussians: Option<DynamicGaussians>,
+    pub gaussians: Option<GaussianField>,
     /// Field that its method draws itself.
     pub own: Option<Arc<dyn Field>>,
 }
 
 impl FitField {
     /// Returns a field that consists of Gaussians alone.
-    pub fn of_gaussians(gaussians: DynamicGaussians) -> FitField {
+    pub fn of_gaussians(gaussians: GaussianField) -> FitField {
         FitField { gaussians: Some(gaussians), ..FitField::default() }
     }
 

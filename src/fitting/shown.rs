@@ -5,7 +5,7 @@ use crate::fitting::fit::{
     Advance, FieldFeed, Fit, FitField, FitProgress, FitState, FitWork, Iterates, Measured, PendingFit, SavedFit,
 };
 use crate::fitting::losses::StepLoss;
-use crate::gaussians::field::{DynamicGaussians, GaussianFeed, Gaussians};
+use crate::gaussians::field::{GaussianFeed, GaussianField, Gaussians};
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::record::PassTime;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -77,7 +77,7 @@ impl<T: SetsFit> ShownFit<T> {
     /// Errors of [`SetsFit::state`].
     pub fn new(fit: T) -> Result<ShownFit<T>> {
         let field = fit.model()?;
-        Ok(ShownFit { fit, feed: Arc::new(Mutex::new((0, DynamicGaussians::PerPhase(field)))) })
+        Ok(ShownFit { fit, feed: Arc::new(Mutex::new((0, GaussianField::PerPhase(field)))) })
     }
 }
 
@@ -98,7 +98,7 @@ impl<T: SetsFit + 'static> Iterates for ShownFit<T> {
         if is_due(before, self.fit.step(), until) {
             let field = self.fit.model()?;
             let mut feed = self.feed.lock().unwrap_or_else(PoisonError::into_inner);
-            *feed = (feed.0 + 1, DynamicGaussians::PerPhase(field));
+            *feed = (feed.0 + 1, GaussianField::PerPhase(field));
         }
         Ok(Advance::of(
             losses.into_iter().zip(before + 1..).map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect(),
@@ -118,7 +118,7 @@ impl<T: SetsFit + 'static> Fit for ShownFit<T> {
 
     fn snapshot(&self) -> Result<PendingFit> {
         let state = self.fit.state()?;
-        let field = DynamicGaussians::PerPhase(self.fit.field_of(&state));
+        let field = GaussianField::PerPhase(self.fit.field_of(&state));
         let saved = SavedFit { field: FitField::of_gaussians(field), state: Arc::new(state) };
         Ok(Box::new(|| Ok(saved)))
     }

@@ -1,7 +1,7 @@
 //! Drawing of Gaussians along rays and at the cells of volumes.
 
 use crate::error::{Error, Result};
-use crate::gaussians::field::{DynamicGaussians, Gaussians, Units, scales};
+use crate::gaussians::field::{GaussianField, Gaussians, Units, scales};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
@@ -82,7 +82,7 @@ struct BlobSet {
 }
 
 impl BlobSet {
-    fn new(gpu: &Gpu, field: &DynamicGaussians) -> Result<BlobSet> {
+    fn new(gpu: &Gpu, field: &GaussianField) -> Result<BlobSet> {
         let (sets, mut all, mut phases) = (field.rows(), Vec::new(), Vec::new());
         for phase in 0..sets.n_phases {
             let first = all.len() as u32;
@@ -95,7 +95,7 @@ impl BlobSet {
 
 /// The field, which is uploaded when it is first drawn: pictures at display rates do not need it here.
 struct Shown {
-    field: DynamicGaussians,
+    field: GaussianField,
     on_device: Option<BlobSet>,
 }
 
@@ -117,13 +117,13 @@ impl Blobs {
     ///
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
-    pub fn new(gpu: &Gpu, tuning: &Tuning, field: &DynamicGaussians) -> Result<Blobs> {
+    pub fn new(gpu: &Gpu, tuning: &Tuning, field: &GaussianField) -> Result<Blobs> {
         let shown = Mutex::new(Shown { field: field.clone(), on_device: None });
         Ok(Blobs { gpu: gpu.clone(), kernels: BlobKernels::new(gpu, tuning)?, shown })
     }
 
     /// Replaces the field to be drawn. Commands that were recorded before draw the old field.
-    pub fn replace(&self, field: &DynamicGaussians) {
+    pub fn replace(&self, field: &GaussianField) {
         *self.shown() = Shown { field: field.clone(), on_device: None };
     }
 
@@ -147,7 +147,7 @@ impl Blobs {
 
     /// Tells whether the field is known between phases.
     pub fn move_between_phases(&self) -> bool {
-        self.shown().field.deformable().is_some()
+        self.shown().field.moving().is_some()
     }
 
     /// Returns the Gaussians of a deformable set at a phase, which may be fractional; none for another field, which is known only at
@@ -158,9 +158,9 @@ impl Blobs {
     pub fn between(&self, phase: f64) -> Result<Option<BlobList>> {
         let blobs: Vec<Blob> = {
             let shown = self.shown();
-            let Some(deformable) = shown.field.deformable() else { return Ok(None) };
-            let Gaussians { units, setup, .. } = &deformable.rest;
-            deformable.at(phase).iter().map(|g| Blob::of(g, *units, setup)).collect()
+            let Some(moving) = shown.field.moving() else { return Ok(None) };
+            let Gaussians { units, setup, .. } = &moving.rest;
+            moving.at(phase).iter().map(|g| Blob::of(g, *units, setup)).collect()
         };
         let range = 0..blobs.len() as u32;
         Ok(Some(BlobList { blobs: upload(&self.gpu, blobs)?, range }))

@@ -1,9 +1,8 @@
 //! Gaussians as the dynamic field, plain data: a set per phase, or one moving set.
 
-use crate::config::GaussianForm;
 use crate::error::{Error, Result};
 use crate::geometry::MM_PER_UNIT;
-use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
+use crate::kernels::layout::{Gaussian, GaussianSetup, MotionGridSetup};
 use glam::DVec3;
 use serde::Serialize;
 use std::sync::{Arc, Mutex};
@@ -151,11 +150,11 @@ pub fn inverse_step(n_nodes: u32, half_side: f32) -> f32 {
 
 /// One set of Gaussians for the whole beat.
 #[derive(Debug, Clone, PartialEq)]
-pub struct DeformableGaussians {
+pub struct MovingGaussians {
     /// Gaussians at the rest phase.
     pub rest: Gaussians,
     /// The grid.
-    pub setup: DeformableSetup,
+    pub setup: MotionGridSetup,
     /// `[phase][node]`: displacement (x, y, z, 0), pixels at the isocentre; zero at the rest phase.
     pub grid: Vec<[f32; 4]>,
     /// `[Gaussian][basis function]`: own motion (x, y, z, 0), pixels at the isocentre.
@@ -167,40 +166,41 @@ pub struct DeformableGaussians {
 
 /// Gaussians as the dynamic field of a model.
 #[derive(Debug, Clone, PartialEq)]
-pub enum DynamicGaussians {
+pub enum GaussianField {
     /// A separate set per phase; the sets share nothing.
     PerPhase(Gaussians),
     /// One moving set for the whole beat.
-    Deformable(DeformableGaussians),
+    Moving(MovingGaussians),
 }
 
 /// Current Gaussians of a run in training, and the number of their changes so far.
-pub type GaussianFeed = Arc<Mutex<(u64, DynamicGaussians)>>;
+pub type GaussianFeed = Arc<Mutex<(u64, GaussianField)>>;
 
-impl DynamicGaussians {
+impl GaussianField {
     /// Returns the Gaussians; for a deformable set, those at its rest phase.
     pub fn rows(&self) -> &Gaussians {
         match self {
-            DynamicGaussians::PerPhase(sets) => sets,
-            DynamicGaussians::Deformable(deformable) => &deformable.rest,
+            GaussianField::PerPhase(sets) => sets,
+            GaussianField::Moving(moving) => &moving.rest,
         }
     }
 
     /// Returns the deformable set, if the field is one.
-    pub fn deformable(&self) -> Option<&DeformableGaussians> {
+    pub fn moving(&self) -> Option<&MovingGaussians> {
         match self {
-            DynamicGaussians::PerPhase(_) => None,
-            DynamicGaussians::Deformable(deformable) => Some(deformable),
+            GaussianField::PerPhase(_) => None,
+            GaussianField::Moving(moving) => Some(moving),
         }
     }
 
-    /// Returns the form of the field: a set per phase as in X-Gaussian, in R2-Gaussian or in neither, or one moving set.
-    pub fn form(&self) -> GaussianForm {
+    /// Returns the name of the field's form in reports: a set per phase of Gaussians that hide others, of many that overlap, or of neither,
+    /// or one moving set.
+    pub fn form(&self) -> &'static str {
         match self {
-            DynamicGaussians::PerPhase(sets) if sets.intensities.is_some() => GaussianForm::X,
-            DynamicGaussians::PerPhase(sets) if sets.is_crowd => GaussianForm::R2,
-            DynamicGaussians::PerPhase(_) => GaussianForm::Phase,
-            DynamicGaussians::Deformable(_) => GaussianForm::Deformable,
+            GaussianField::PerPhase(sets) if sets.intensities.is_some() => "x",
+            GaussianField::PerPhase(sets) if sets.is_crowd => "r2",
+            GaussianField::PerPhase(_) => "phase",
+            GaussianField::Moving(_) => "deformable",
         }
     }
 
@@ -212,17 +212,17 @@ impl DynamicGaussians {
     /// Returns the Gaussians at a time counted in phases; those of the nearest phase where each phase has its own set.
     pub fn at_time(&self, phases: f64) -> Vec<Gaussian> {
         match self {
-            DynamicGaussians::PerPhase(sets) => sets.at(phases.round() as usize % sets.n_phases).copied().collect(),
-            DynamicGaussians::Deformable(deformable) => deformable.at(phases),
+            GaussianField::PerPhase(sets) => sets.at(phases.round() as usize % sets.n_phases).copied().collect(),
+            GaussianField::Moving(moving) => moving.at(phases),
         }
     }
 
     /// Returns the Gaussians as images show them at a time counted in phases: filled with contrast as far as it had come. Those of
-    /// [`DynamicGaussians::at_time`] are full.
+    /// [`GaussianField::at_time`] are full.
     pub fn imaged_at_time(&self, phases: f64) -> Vec<Gaussian> {
         match self {
-            DynamicGaussians::PerPhase(_) => self.at_time(phases),
-            DynamicGaussians::Deformable(deformable) => deformable.imaged_at(phases),
+            GaussianField::PerPhase(_) => self.at_time(phases),
+            GaussianField::Moving(moving) => moving.imaged_at(phases),
         }
     }
 
@@ -244,7 +244,7 @@ pub fn basis(n_basis: usize, fraction: f64) -> Vec<f64> {
 }
 
 /// Returns the nodes around a point with their interpolation weights.
-pub fn shares(setup: &DeformableSetup, x: DVec3) -> [(usize, f64); 8] {
+pub fn shares(setup: &MotionGridSetup, x: DVec3) -> [(usize, f64); 8] {
     let n = setup.n_nodes as usize;
     let last = DVec3::splat(f64::from(setup.n_nodes) - 1.001);
     let place = (x + f64::from(setup.half_side)) * f64::from(setup.inverse_step);
@@ -273,7 +273,7 @@ pub(crate) fn vector(v: &[f32; 4]) -> DVec3 {
     DVec3::new(v[0].into(), v[1].into(), v[2].into())
 }
 
-impl DeformableGaussians {
+impl MovingGaussians {
     /// Returns the position at a phase to which the grid moves a point of the rest phase. The phase may be fractional; the
     /// motion is periodic.
     pub fn carried(&self, x: DVec3, phase: f64) -> DVec3 {
@@ -383,7 +383,7 @@ mod tests {
 
     #[test]
     fn shares_are_trilinear() {
-        let setup = DeformableSetup { n_nodes: 4, half_side: 30.0, inverse_step: 0.05, ..DeformableSetup::default() };
+        let setup = MotionGridSetup { n_nodes: 4, half_side: 30.0, inverse_step: 0.05, ..MotionGridSetup::default() };
         let x = DVec3::new(-17.0, 3.0, 22.0);
         let all = shares(&setup, x);
         assert!((all.iter().map(|s| s.1).sum::<f64>() - 1.0).abs() < 1e-12);

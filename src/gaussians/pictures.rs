@@ -4,7 +4,7 @@
 use crate::error::Result;
 use crate::gaussians::blending::picture::{self, BlendedPicture};
 use crate::gaussians::blending::stages::BlendKernels;
-use crate::gaussians::field::{DynamicGaussians, Units};
+use crate::gaussians::field::{GaussianField, Units};
 use crate::gaussians::stages::{FIXED_POINT_BITS, SplatStage};
 use crate::gaussians::view::SplatView;
 use crate::geometry::ViewRays;
@@ -69,13 +69,13 @@ pub struct Pictures {
 
 /// The field, and pictures recorded of it.
 struct State {
-    field: DynamicGaussians,
+    field: GaussianField,
     recorded: HashMap<Key, Arc<Picture>>,
     blended: HashMap<Key, Arc<Mutex<BlendedPicture>>>,
 }
 
 impl State {
-    fn new(field: &DynamicGaussians) -> State {
+    fn new(field: &GaussianField) -> State {
         State { field: field.clone(), recorded: HashMap::new(), blended: HashMap::new() }
     }
 }
@@ -112,7 +112,7 @@ impl Pictures {
     ///
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
-    pub fn new(gpu: &Gpu, field: &DynamicGaussians) -> Result<Pictures> {
+    pub fn new(gpu: &Gpu, field: &GaussianField) -> Result<Pictures> {
         Pictures::filled(gpu, field, Fill::Full)
     }
 
@@ -120,11 +120,11 @@ impl Pictures {
     ///
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
-    pub fn as_imaged(gpu: &Gpu, field: &DynamicGaussians) -> Result<Pictures> {
+    pub fn as_imaged(gpu: &Gpu, field: &GaussianField) -> Result<Pictures> {
         Pictures::filled(gpu, field, Fill::Imaged)
     }
 
-    fn filled(gpu: &Gpu, field: &DynamicGaussians, fill: Fill) -> Result<Pictures> {
+    fn filled(gpu: &Gpu, field: &GaussianField, fill: Fill) -> Result<Pictures> {
         let state = Mutex::new(State::new(field));
         let project = Build::default().stage(gpu)?;
         let blend = field.rows().intensities.as_ref().map(|_| BlendKernels::new(gpu)).transpose()?;
@@ -133,7 +133,7 @@ impl Pictures {
     }
 
     /// Replaces the field to be drawn.
-    pub fn replace(&self, field: &DynamicGaussians) {
+    pub fn replace(&self, field: &GaussianField) {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         *state = State::new(field);
     }
@@ -243,7 +243,7 @@ impl Pictures {
         Ok((units, picture))
     }
 
-    fn record(&self, field: &DynamicGaussians, key: Key) -> Result<Picture> {
+    fn record(&self, field: &GaussianField, key: Key) -> Result<Picture> {
         let (gpu, sets) = (&self.gpu, field.rows());
         let (width, height) = (key.columns, key.rows);
         let time = f64::from_bits(key.time);

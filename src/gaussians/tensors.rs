@@ -1,8 +1,8 @@
 //! Gaussians in a checkpoint: tensors under documented names, and their section of the header.
 
 use crate::error::{Error, Result};
-use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, FitAgreement, Gaussians, Units, inverse_step};
-use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
+use crate::gaussians::field::{FitAgreement, GaussianField, Gaussians, MovingGaussians, Units, inverse_step};
+use crate::kernels::layout::{Gaussian, GaussianSetup, MotionGridSetup};
 use crate::tensors::{File, FileTensor};
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
@@ -74,7 +74,7 @@ const AGREEMENT: &str = "gaussians.agreement";
 /// Name of the tensor of fillings.
 const FILLING: &str = "gaussians.filling";
 
-pub(crate) fn header(field: &DynamicGaussians) -> GaussianHeader {
+pub(crate) fn header(field: &GaussianField) -> GaussianHeader {
     let sets = field.rows();
     GaussianHeader {
         pixel: sets.units.pixel,
@@ -89,19 +89,19 @@ pub(crate) fn header(field: &DynamicGaussians) -> GaussianHeader {
         agreement: sets.agreement.as_ref().map(|agreement| agreement.overall),
         agreements: sets.agreement.as_ref().is_some_and(|agreement| !agreement.of_gaussians.is_empty()),
         grid: match field {
-            DynamicGaussians::PerPhase(_) => None,
-            DynamicGaussians::Deformable(deformable) => Some(GridHeader {
-                nodes: deformable.setup.n_nodes,
-                half_side: deformable.setup.half_side,
-                basis: deformable.setup.n_basis,
-                rest_phase: deformable.setup.rest_phase,
-                filling: deformable.filling.is_some(),
+            GaussianField::PerPhase(_) => None,
+            GaussianField::Moving(moving) => Some(GridHeader {
+                nodes: moving.setup.n_nodes,
+                half_side: moving.setup.half_side,
+                basis: moving.setup.n_basis,
+                rest_phase: moving.setup.rest_phase,
+                filling: moving.filling.is_some(),
             }),
         },
     }
 }
 
-pub(crate) fn tensors(field: &DynamicGaussians) -> Vec<FileTensor> {
+pub(crate) fn tensors(field: &GaussianField) -> Vec<FileTensor> {
     let rows = &field.rows().rows;
     let floats = |name: &str, width: usize, of: &dyn Fn(&Gaussian) -> Vec<f32>| -> FileTensor {
         let bytes = rows.iter().flat_map(of).flat_map(f32::to_le_bytes).collect();
@@ -123,28 +123,28 @@ pub(crate) fn tensors(field: &DynamicGaussians) -> Vec<FileTensor> {
         all.push((AGREEMENT.into(), Dtype::F32, vec![rows.len()], bytes));
     }
     match field {
-        DynamicGaussians::PerPhase(_) => {
+        GaussianField::PerPhase(_) => {
             let phases = rows.iter().flat_map(|g| g.phase.to_le_bytes()).collect();
             all.push(("gaussians.phase".into(), Dtype::U32, vec![rows.len()], phases));
         }
-        DynamicGaussians::Deformable(deformable) => {
+        GaussianField::Moving(moving) => {
             let vectors = |name: &str, shape: Vec<usize>, values: &[[f32; 4]]| -> FileTensor {
                 let bytes = values.iter().flat_map(|v| v[..3].to_vec()).flat_map(f32::to_le_bytes).collect();
                 (format!("gaussians.{name}"), Dtype::F32, shape, bytes)
             };
-            let (n, basis) = (deformable.setup.n_nodes as usize, deformable.setup.n_basis as usize);
-            all.push(vectors("motion.grid", vec![deformable.rest.n_phases, n, n, n, 3], &deformable.grid));
-            all.push(vectors("motion.own", vec![rows.len(), basis, 3], &deformable.own));
-            if let Some(filling) = &deformable.filling {
+            let (n, basis) = (moving.setup.n_nodes as usize, moving.setup.n_basis as usize);
+            all.push(vectors("motion.grid", vec![moving.rest.n_phases, n, n, n, 3], &moving.grid));
+            all.push(vectors("motion.own", vec![rows.len(), basis, 3], &moving.own));
+            if let Some(filling) = &moving.filling {
                 let bytes = filling.iter().flat_map(|v| v.to_le_bytes()).collect();
-                all.push((FILLING.into(), Dtype::F32, vec![rows.len(), deformable.rest.n_phases], bytes));
+                all.push((FILLING.into(), Dtype::F32, vec![rows.len(), moving.rest.n_phases], bytes));
             }
         }
     }
     all
 }
 
-impl DynamicGaussians {
+impl GaussianField {
     /// Returns the number of bytes that the field takes in a checkpoint.
     pub fn bytes(&self) -> usize {
         tensors(self).iter().map(|(.., bytes)| bytes.len()).sum()
@@ -155,7 +155,7 @@ impl DynamicGaussians {
 ///
 /// # Errors
 /// [`Error::Data`] naming what is missing, misshapen or not finite.
-pub(crate) fn read_section(sections: &serde_json::Value, file: &File<'_>, n_phases: usize) -> Result<DynamicGaussians> {
+pub(crate) fn read_section(sections: &serde_json::Value, file: &File<'_>, n_phases: usize) -> Result<GaussianField> {
     let header: GaussianHeader = serde_json::from_value(sections[SECTION].clone())
         .map_err(|e| Error::data(file.path, SECTION, e.to_string()))?;
     read(&header, file, n_phases)
@@ -169,7 +169,7 @@ fn agreement(header: &GaussianHeader, file: &File<'_>, n: usize) -> Result<Optio
 }
 
 /// Reads the Gaussians that [`header`] and [`tensors`] describe.
-pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) -> Result<DynamicGaussians> {
+pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) -> Result<GaussianField> {
     let path = file.path;
     let positive = [header.pixel, header.strongest, header.cut.into(), header.min_scale.into()];
     if positive.iter().any(|v| !(v.is_finite() && *v > 0.0)) || header.max_scale < header.min_scale {
@@ -217,7 +217,7 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
         intensities: header.blended.then(|| file.floats(INTENSITY, &[Some(n)])).transpose()?,
         agreement: agreement(header, file, n)?,
     };
-    let Some(grid) = &header.grid else { return Ok(DynamicGaussians::PerPhase(sets)) };
+    let Some(grid) = &header.grid else { return Ok(GaussianField::PerPhase(sets)) };
     if !(2..=MAX_NODES).contains(&grid.nodes)
         || grid.basis > MAX_BASIS
         || grid.half_side.is_nan()
@@ -238,14 +238,14 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
     if let Some(bad) = filling.iter().flatten().find(|v| !(**v > 0.0 && **v <= 1.0)) {
         return Err(Error::data(path, FILLING, format!("has the value {bad}, but fillings are above 0 and at most 1")));
     }
-    Ok(DynamicGaussians::Deformable(DeformableGaussians {
-        setup: DeformableSetup {
+    Ok(GaussianField::Moving(MovingGaussians {
+        setup: MotionGridSetup {
             n_nodes: grid.nodes,
             half_side: grid.half_side,
             inverse_step: inverse_step(grid.nodes, grid.half_side),
             n_basis: grid.basis,
             rest_phase: grid.rest_phase,
-            ..DeformableSetup::default()
+            ..MotionGridSetup::default()
         },
         grid: vectors("gaussians.motion.grid", &[Some(n_phases), nodes, nodes, nodes, Some(3)])?,
         own: vectors("gaussians.motion.own", &[Some(n), Some(grid.basis as usize), Some(3)])?,

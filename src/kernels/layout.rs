@@ -28,7 +28,7 @@ impl Setup {
     }
 }
 
-impl DeformableSetup {
+impl MotionGridSetup {
     /// Number of grid nodes of one phase.
     pub fn nodes(&self) -> usize {
         (self.n_nodes as usize).pow(3)

@@ -3,7 +3,7 @@
 use crate::error::{Error, Result};
 use crate::fields::setup::sample_capacity;
 use crate::gaussians::blobs::{BlobList, Blobs};
-use crate::gaussians::field::DynamicGaussians;
+use crate::gaussians::field::GaussianField;
 use crate::gaussians::pictures::Pictures;
 use crate::geometry::ViewRays;
 use crate::gpu::buffer::{Buffer, Memory};
@@ -229,7 +229,7 @@ impl Renderer {
     ///
     /// # Errors
     /// [`Error::Internal`] where a network is the dynamic field; device errors.
-    pub fn set_gaussians(&self, field: &DynamicGaussians) -> Result<()> {
+    pub fn set_gaussians(&self, field: &GaussianField) -> Result<()> {
         match (&self.blobs, &self.pictures) {
             (Some(blobs), Some(pictures)) => {
                 pictures.replace(field);

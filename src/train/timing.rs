@@ -75,6 +75,9 @@ pub struct GaussianTiming {
     pub form: String,
     /// Gaussians after the timed iterations.
     pub count: u32,
+    /// Whether their number grows after the timed iterations; missing in older reports.
+    #[serde(default)]
+    pub grows: bool,
     /// Seconds from targets to the first iteration, median of the repeats: seeds, and of a deformable set the sets per phase and the
     /// tracking of its grid.
     pub preparation_s: f64,
@@ -289,7 +292,7 @@ pub struct GaussianSubject {
     notes: Vec<String>,
 }
 
-/// Timed iterations of R2-Gaussian and X-Gaussian, out of thousands that come before their Gaussians become more.
+/// Timed iterations of fits of Gaussians alone, out of thousands that come before their Gaussians become more.
 const ALONE_TIMED: u32 = 200;
 
 /// Minimum number of fits: one says nothing of how they differ.
@@ -389,6 +392,7 @@ impl GaussianSubject {
         let timing = GaussianTiming {
             form: work.form.unwrap_or_else(|| self.config.gaussians.form.name()).into(),
             count: work.count,
+            grows: self.config.method().is_alone(),
             preparation_s: median(&preparation_s),
             ms,
             host_cpu_share,

@@ -8,9 +8,9 @@ use glam::{DMat3, DVec3};
 use nertca_vk::checkpoint::Checkpoint;
 use nertca_vk::fields::state::FieldsState;
 use nertca_vk::formats::npy;
-use nertca_vk::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, Units};
+use nertca_vk::gaussians::field::{GaussianField, Gaussians, MovingGaussians, Units};
 use nertca_vk::gaussians::view::SplatView;
-use nertca_vk::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
+use nertca_vk::kernels::layout::{Gaussian, GaussianSetup, MotionGridSetup};
 use nertca_vk::model::Model;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
@@ -63,7 +63,7 @@ fn place(i: usize, phase: f64) -> DVec3 {
     x + moved + own_at(before).lerp(own_at(before + 1), share)
 }
 
-fn tree() -> DeformableGaussians {
+fn tree() -> MovingGaussians {
     let step = 2.0 * HALF_SIDE / f64::from(NODES - 1);
     let n = NODES as usize;
     let node = |i: usize| DVec3::new((i % n) as f64, (i / n % n) as f64, (i / n / n) as f64) * step - HALF_SIDE;
@@ -75,7 +75,7 @@ fn tree() -> DeformableGaussians {
         phase: REST as u32,
         rotation: [1.0, 0.2 * i as f32, -0.3, 0.5],
     };
-    DeformableGaussians {
+    MovingGaussians {
         rest: Gaussians {
             units: UNITS,
             n_phases: PHASES,
@@ -87,13 +87,13 @@ fn tree() -> DeformableGaussians {
             agreement: None,
             intensities: None,
         },
-        setup: DeformableSetup {
+        setup: MotionGridSetup {
             n_nodes: NODES,
             half_side: HALF_SIDE as f32,
             inverse_step: (1.0 / step) as f32,
             n_basis: 2,
             rest_phase: REST as u32,
-            ..DeformableSetup::default()
+            ..MotionGridSetup::default()
         },
         grid: (0..PHASES).flat_map(|t| (0..n.pow(3)).map(move |i| pack(displacement(node(i), t)))).collect(),
         own: (0..6).flat_map(|i| own(i).map(pack)).collect(),
@@ -102,7 +102,7 @@ fn tree() -> DeformableGaussians {
 }
 
 /// An untrained model with a dynamic field.
-fn model(preset: &str, moving: Option<DynamicGaussians>) -> Model {
+fn model(preset: &str, moving: Option<GaussianField>) -> Model {
     let dataset = small_dataset(SIZE[0], SIZE[1]);
     let plan = Plan::new(&small_config(preset, &[]), &dataset).unwrap();
     Model {
@@ -121,7 +121,7 @@ fn model(preset: &str, moving: Option<DynamicGaussians>) -> Model {
 }
 
 fn moving_model() -> Model {
-    model("fast", Some(DynamicGaussians::Deformable(tree())))
+    model("fast", Some(GaussianField::Moving(tree())))
 }
 
 fn saved(model: Model, path: &Path) -> String {
@@ -193,10 +193,10 @@ fn any_moment_of_the_beat_can_be_rendered() {
     // After a change, the new field is rendered from the next picture, also between phases.
     let mut other = tree();
     other.rest.rows.iter_mut().for_each(|g| g.log_density = -30.0);
-    renderer.set_gaussians(&DynamicGaussians::Deformable(other)).unwrap();
+    renderer.set_gaussians(&GaussianField::Moving(other)).unwrap();
     assert!(at(0.5).dynamic_integral.iter().all(|v| *v < 1e-9));
     // Fields that are known at whole phases only give an error.
-    renderer.set_gaussians(&DynamicGaussians::PerPhase(tree().expand())).unwrap();
+    renderer.set_gaussians(&GaussianField::PerPhase(tree().expand())).unwrap();
     assert_eq!(at(2.0).dynamic_integral, whole(2).dynamic_integral);
     let between = renderer.render_at(rays, width, height, 0.5).unwrap_err().to_string();
     assert!(between.contains("between two phases") && between.contains("gaussians.form = \"deformable\""), "{between}");
@@ -245,7 +245,7 @@ fn the_program_renders_between_phases() {
     refuses(&[&render[..], &["1", "--between", "2"]].concat(), &["--between", "--phase all"]);
     refuses(&[&render[..], &["1.5", "--baked"]].concat(), &["--baked", "whole phases"]);
     let sets =
-        saved(model("fast", Some(DynamicGaussians::PerPhase(tree().expand()))), &dir.path().join("sets.safetensors"));
+        saved(model("fast", Some(GaussianField::PerPhase(tree().expand()))), &dir.path().join("sets.safetensors"));
     let network = saved(model("fast-mlp", None), &dir.path().join("network.safetensors"));
     refuses(&["render", &sets, "--out", "x.npy", "--phase", "0.5"], &["between two phases", "whole", "deformable"]);
     refuses(&["render", &sets, "--out", "x.npy", "--phase", "3"], &["--phase", "0 to 2"]);
@@ -339,7 +339,7 @@ fn motion_that_is_not_known_is_not_exported() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("x.nrrd");
     let sets =
-        saved(model("fast", Some(DynamicGaussians::PerPhase(tree().expand()))), &dir.path().join("sets.safetensors"));
+        saved(model("fast", Some(GaussianField::PerPhase(tree().expand()))), &dir.path().join("sets.safetensors"));
     let network = saved(model("fast-mlp", None), &dir.path().join("network.safetensors"));
     let moves = saved(moving_model(), &dir.path().join("tree.safetensors"));
     let export = |run: &str, extra: &[&str], parts: &[&str]| {

@@ -4,7 +4,7 @@
 use crate::common::{expect_silence, run, small_config, small_dataset};
 use crate::shim;
 use nertca_vk::fields::state::FieldsState;
-use nertca_vk::gaussians::field::DynamicGaussians;
+use nertca_vk::gaussians::field::GaussianField;
 use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::layout::Gaussian;
@@ -30,9 +30,9 @@ fn gpu() -> Gpu {
 }
 
 /// All parameters of Gaussians and of the grid that moves them.
-fn parameters(field: &DynamicGaussians) -> Vec<f32> {
+fn parameters(field: &GaussianField) -> Vec<f32> {
     let of = |g: &Gaussian| g.position.into_iter().chain(g.log_scale).chain(g.rotation).chain([g.log_density]);
-    let moves = field.deformable().map_or(Vec::new(), |tree| [&tree.grid[..], &tree.own].concat());
+    let moves = field.moving().map_or(Vec::new(), |tree| [&tree.grid[..], &tree.own].concat());
     field.rows().rows.iter().flat_map(of).chain(moves.into_iter().flatten()).collect()
 }
 

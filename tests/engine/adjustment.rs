@@ -9,7 +9,7 @@ use nertca_vk::calibrate::{adjusted, calibrate};
 use nertca_vk::config::{AdjustMode, Config, Preset};
 use nertca_vk::fields::scale::dynamic_half;
 use nertca_vk::fitting::fit::{AdjustTask, FitField, MadeFit, Start, Use};
-use nertca_vk::gaussians::field::DeformableGaussians;
+use nertca_vk::gaussians::field::MovingGaussians;
 use nertca_vk::gaussians::view::SplatView;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::gpu::device::Gpu;
@@ -69,7 +69,7 @@ fn wrong_poses(n_views: usize) -> Poses {
 }
 
 /// Images of a field in f64, `[image][pixel]`.
-fn twin(field: &DeformableGaussians, targets: &Targets, views: &[SplatView]) -> Vec<f64> {
+fn twin(field: &MovingGaussians, targets: &Targets, views: &[SplatView]) -> Vec<f64> {
     let mut images = vec![0.0; targets.n_images * targets.n_pixels()];
     for (at, image) in targets.image_of.iter().enumerate() {
         let Some(image) = *image else { continue };

@@ -4,7 +4,7 @@ use crate::common;
 use crate::common::{gpu, tuning};
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::fields::data::FieldData;
-use nertca_vk::gaussians::field::DynamicGaussians;
+use nertca_vk::gaussians::field::GaussianField;
 use nertca_vk::gaussians::pictures::Pictures;
 use nertca_vk::methods::dynamic_gaussians::data::GaussianData;
 use nertca_vk::plan::Plan;
@@ -87,9 +87,9 @@ fn pictures_are_full_or_filled_as_images_are() {
     let dataset = common::small_dataset(37, 29);
     let rays = &dataset.views[1].rays;
     let [_, full] = drawn_fields();
-    let Some(mut set) = full.deformable().cloned() else { unreachable!() };
+    let Some(mut set) = full.moving().cloned() else { unreachable!() };
     set.filling = Some((0..set.rest.rows.len()).flat_map(|_| FILLING).collect());
-    let field = DynamicGaussians::Deformable(set);
+    let field = GaussianField::Moving(set);
     let [plain, shown] = [&full, &field].map(|field| Pictures::new(&gpu, field).unwrap());
     let imaged = Pictures::as_imaged(&gpu, &field).unwrap();
     for (time, share) in [(0.0, 1.0), (1.0, 0.5), (1.4, 0.38), (2.5, 0.6)] {

@@ -5,7 +5,7 @@ use crate::common::{expect_silence, gpu, tuning};
 use nertca_vk::checkpoint::Checkpoint;
 use nertca_vk::config::{Config, GaussianForm, Preset};
 use nertca_vk::fitting::fit::{FitField, Start, Use};
-use nertca_vk::gaussians::field::DynamicGaussians;
+use nertca_vk::gaussians::field::GaussianField;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::plan::Plan;
@@ -81,7 +81,7 @@ fn train(session: &Session) -> u32 {
     session.train(u32::MAX, &mut |_| true).unwrap()
 }
 
-fn field(session: &Session) -> DynamicGaussians {
+fn field(session: &Session) -> GaussianField {
     session.checkpoint().unwrap().model.gaussians.unwrap()
 }
 
@@ -176,13 +176,13 @@ fn what_was_there_is_shown_until_there_is_better() {
             assert_eq!(with_sets, 0, "the earlier field does not come back");
             with_earlier += 1;
         } else {
-            assert!(shown().deformable().is_none(), "a set per phase");
+            assert!(shown().moving().is_none(), "a set per phase");
             with_sets += 1;
         }
         trainer.advance(1).unwrap();
     }
     assert!(with_earlier > 1 && with_sets > 3, "{with_earlier} and {with_sets} advances");
-    assert!(shown() != earlier && shown().deformable().is_some());
+    assert!(shown() != earlier && shown().moving().is_some());
     drop(trainer);
     expect_silence(gpu);
 }

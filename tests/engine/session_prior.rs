@@ -5,7 +5,7 @@ use crate::common::{expect_silence, gpu, run, tuning};
 use crate::disagreeing::{Studio, Wrong};
 use nertca_vk::calibrate::calibrate;
 use nertca_vk::config::{Config, Preset};
-use nertca_vk::gaussians::field::DynamicGaussians;
+use nertca_vk::gaussians::field::GaussianField;
 use nertca_vk::plan::Plan;
 use nertca_vk::scan::prior::VesselPrior;
 use nertca_vk::train::trainer::Trainer;
@@ -17,7 +17,7 @@ fn a_session_fits_as_a_run_with_the_same_prior() {
     let gpu = gpu();
     let shot = Studio::new(&gpu, 64, 1).shoot(3, false, Wrong::default());
     let prior = VesselPrior { shapes_mm: vec![shot.points_mm(0)] };
-    let of_session = |prior: Option<VesselPrior>| -> DynamicGaussians {
+    let of_session = |prior: Option<VesselPrior>| -> GaussianField {
         let session = session(&gpu, &shot);
         session.set_prior(prior).unwrap();
         assert_eq!(session.train(ITERATIONS, &mut |_| true).unwrap(), ITERATIONS);
@@ -25,7 +25,7 @@ fn a_session_fits_as_a_run_with_the_same_prior() {
         session.stop().unwrap();
         gaussians.unwrap()
     };
-    let of_run = |prior: VesselPrior| -> DynamicGaussians {
+    let of_run = |prior: VesselPrior| -> GaussianField {
         let mut config = Config::preset(Preset::Fast);
         config.gaussians.fits = 1;
         let mut dataset = shot.dataset.clone();

@@ -47,7 +47,7 @@ fn every_stage_matches_with_and_without_subgroups() {
         }
         expect_agreement(|findings| gaussians::compare(&gpu, findings));
         expect_agreement(|findings| deformable::compare(&gpu, findings));
-        expect_agreement(|findings| repeats::compare_gaussians(&gpu, findings));
+        expect_agreement(|findings| deformable::compare_equal_runs(&gpu, findings));
         expect_agreement(|findings| repeats::compare_network(&gpu, &dataset, &paths[0], findings));
         let built = gpu.pipeline_statistics();
         assert!(built.iter().any(|kernel| kernel.kernel.starts_with("gaussian_moments")));

@@ -7,7 +7,7 @@ use nertca_vk::checkpoint::{self, Checkpoint};
 use nertca_vk::config::{AdjustMode, Config, Preset, sections};
 use nertca_vk::error::Error;
 use nertca_vk::fields::state::FieldsState;
-use nertca_vk::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians};
+use nertca_vk::gaussians::field::{GaussianField, Gaussians, MovingGaussians};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::DeviceState;
 use nertca_vk::methods::dynamic_gaussians::trainer::GaussiansFit;
@@ -27,7 +27,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Creates a model of a dataset with the dynamic field `field`.
-fn model(gpu: &Gpu, dataset: &Dataset, field: DynamicGaussians) -> Model {
+fn model(gpu: &Gpu, dataset: &Dataset, field: GaussianField) -> Model {
     blobs::model(gpu, dataset, field, &tuning(gpu)).unwrap()
 }
 
@@ -86,11 +86,11 @@ fn bounds_hold_all_around_their_points() {
 }
 
 /// A deformable set with fillings.
-fn filled_field() -> DynamicGaussians {
-    let [_, DynamicGaussians::Deformable(mut set)] = drawn_fields() else { unreachable!() };
+fn filled_field() -> GaussianField {
+    let [_, GaussianField::Moving(mut set)] = drawn_fields() else { unreachable!() };
     let value = |i: usize| 0.55 + 0.45 * (0.7 * i as f32).sin();
     set.filling = Some((0..set.rest.rows.len() * set.rest.n_phases).map(value).collect());
-    DynamicGaussians::Deformable(set)
+    GaussianField::Moving(set)
 }
 
 #[test]
@@ -100,9 +100,7 @@ fn impossible_fillings_are_refused_by_name() {
     let state = FieldsState::fresh(model.step, model.param_map.len);
     for bad in [-0.1, 0.0, 1.2, f32::NAN] {
         let mut model = model.clone();
-        if let Some(DynamicGaussians::Deformable(DeformableGaussians { filling: Some(filling), .. })) =
-            &mut model.gaussians
-        {
+        if let Some(GaussianField::Moving(MovingGaussians { filling: Some(filling), .. })) = &mut model.gaussians {
             filling[5] = bad;
         }
         let saved = Checkpoint { model, fit: Arc::new(state.clone()), data_fingerprint: String::new() };
@@ -143,7 +141,7 @@ fn damaged_gaussians_are_refused_by_name() {
     let state = FieldsState::fresh(model.step, model.param_map.len);
     let refused = |change: &dyn Fn(&mut Gaussians)| {
         let mut model = model.clone();
-        if let Some(DynamicGaussians::PerPhase(sets)) = &mut model.gaussians {
+        if let Some(GaussianField::PerPhase(sets)) = &mut model.gaussians {
             change(sets);
         }
         let saved = Checkpoint { model, fit: Arc::new(state.clone()), data_fingerprint: String::new() };
@@ -217,7 +215,7 @@ fn resume_equals_no_interruption() {
         }
         let read = Checkpoint::from_bytes(&whole, Path::new("whole")).unwrap();
         assert_eq!(read.model.step, 32);
-        assert_eq!(matches!(read.model.gaussians, Some(DynamicGaussians::Deformable(_))), form == "tree");
+        assert_eq!(matches!(read.model.gaussians, Some(GaussianField::Moving(_))), form == "tree");
     }
     expect_silence(gpu);
 }

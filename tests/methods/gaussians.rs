@@ -8,7 +8,7 @@ use nertca_vk::config::sections;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Result;
 use nertca_vk::fields::scale::dynamic_half;
-use nertca_vk::gaussians::field::{DeformableGaussians, Gaussians};
+use nertca_vk::gaussians::field::{Gaussians, MovingGaussians};
 use nertca_vk::gaussians::particles::Particles;
 use nertca_vk::gaussians::view::SplatView;
 use nertca_vk::gpu::device::Gpu;
@@ -26,7 +26,7 @@ use nertca_vk_twins::reference::maxima::maxima;
 use nertca_vk_twins::selftest::dynamic_gaussians;
 use nertca_vk_twins::selftest::gaussians::{self, TENSORS, device_gradient, numbers, twin};
 use nertca_vk_twins::selftest::problems::{
-    self, ANGLES_DEG, deformable_case, deformable_set, fillings, random_gaussians, units, with_gaussians,
+    self, ANGLES_DEG, deformable_case, fillings, moving_set, random_gaussians, units, with_gaussians,
 };
 use nertca_vk_vessels::score::metrics;
 use nertca_vk_vessels::vessels::threshold::VESSEL_SHARE;
@@ -369,7 +369,7 @@ fn a_reseeded_fit_moves_as_the_earlier_one_and_has_gaussians_of_its_own() {
     let seeded = second.deformable().unwrap();
     assert_eq!((second.step(), seeded.rest.rows.len()), (0, config.gaussians.count as usize));
     let n_basis = seeded.setup.n_basis as usize;
-    let own = |set: &DeformableGaussians, i: usize| set.own[i * n_basis..][..n_basis].to_vec();
+    let own = |set: &MovingGaussians, i: usize| set.own[i * n_basis..][..n_basis].to_vec();
     let mut farthest = 0f64;
     for (i, g) in seeded.rest.rows.iter().enumerate() {
         assert_eq!(g.phase, seeded.setup.rest_phase);
@@ -506,7 +506,7 @@ fn tree_twin_gradient_is_the_derivative_of_its_loss() {
     let (targets, rows, Config { deformable: settings, .. }) = deformable_case().unwrap();
     let setup = GaussianSetup { cut: 12.0, ..setup::gaussian_setup(&targets, &config().gaussians) };
     let tree = setup::deformable_setup(&targets, &settings);
-    let mut p = deformable_set(&rows[..7], &tree, targets.n_phases);
+    let mut p = moving_set(&rows[..7], &tree, targets.n_phases);
     p.filling = fillings(7, targets.n_phases, targets.rest_phase);
     let (_, _, gradient) = loss_and_gradient(&targets, &setup, &tree, &p);
     let check = |what: &str, want: f64, change: &dyn Fn(&mut DeformableParams, f64)| {

@@ -12,9 +12,9 @@ use nertca_vk::checkpoint::Checkpoint;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
 use nertca_vk::fitting::shown::SetsFit;
-use nertca_vk::gaussians::field::DynamicGaussians;
+use nertca_vk::gaussians::field::GaussianField;
 use nertca_vk::gpu::device::Gpu;
-use nertca_vk::kernels::layout::{R2Gaussian, R2Turn};
+use nertca_vk::kernels::layout::{PictureTurn, R2Gaussian};
 use nertca_vk::methods::r2_gaussian::data::R2Data;
 use nertca_vk::methods::r2_gaussian::densify::densified;
 use nertca_vk::methods::r2_gaussian::fdk::back_projection;
@@ -209,12 +209,12 @@ fn expect_golden(file: &str, integral: &str) {
     let state = R2State::fresh(start.clone());
     let mut fit = R2Trainer::with(&gpu, data_of(&dataset, &config), &config, &state, 0).unwrap();
     let (shown, corner) = (golden.case["shown"].as_array().unwrap(), f32s("corner"));
-    let turn = |(step, image): (usize, &serde_json::Value)| R2Turn {
+    let turn = |(step, image): (usize, &serde_json::Value)| PictureTurn {
         corner: corner[3 * step..][..3].try_into().unwrap(),
         image: image.as_u64().unwrap() as u32,
     };
-    let turns: Vec<R2Turn> = shown.iter().enumerate().map(turn).collect();
-    gpu.upload(&fit.buffers().r2_turns, 0, &turns).unwrap();
+    let turns: Vec<PictureTurn> = shown.iter().enumerate().map(turn).collect();
+    gpu.upload(&fit.buffers().picture_turns, 0, &turns).unwrap();
     let (loss, gradient) = twin(fit.data(), fit.setups(), &turns[..1], &with_sets(&start));
     let want_loss: f64 = golden.get("terms").iter().sum();
     assert!((loss / want_loss - 1.0).abs() < 1e-6, "{loss} against {want_loss}");
@@ -282,7 +282,7 @@ fn gaussians_are_seen_and_drawn_as_the_closed_form_has_them() {
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     let mut saved = trainer.checkpoint().unwrap();
     let fit = R2Trainer::with(&gpu, data_of(&dataset, &config), &config, &R2State::fresh(rows), 0).unwrap();
-    saved.model.gaussians = Some(DynamicGaussians::PerPhase(fit.model().unwrap()));
+    saved.model.gaussians = Some(GaussianField::PerPhase(fit.model().unwrap()));
     let renderer = Renderer::new(&gpu, &saved.model, tuning(&gpu)).unwrap();
     for (frame, view) in dataset.frames.iter().zip(&dataset.views) {
         let drawn = renderer.render(&view.rays, 33, 27, 0).unwrap();

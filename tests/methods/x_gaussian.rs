@@ -12,7 +12,7 @@ use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
 use nertca_vk::fitting::shown::SetsFit;
 use nertca_vk::gpu::device::Gpu;
-use nertca_vk::kernels::layout::{R2Turn, XGaussian, XStatistics};
+use nertca_vk::kernels::layout::{BlendGaussian, PictureTurn, XStatistics};
 use nertca_vk::methods::x_gaussian::data::XData;
 use nertca_vk::methods::x_gaussian::densify::densified;
 use nertca_vk::methods::x_gaussian::setup::turns;
@@ -101,7 +101,7 @@ fn golden_values_of_pytorch() {
     let get = |name: &str| f32s(&format!("start/{name}"));
     let (position, scale, rotation) = (get("position"), get("scale"), get("rotation"));
     let (opacity, intensity) = (get("opacity"), get("intensity"));
-    let row = |i: usize| XGaussian {
+    let row = |i: usize| BlendGaussian {
         position: position[3 * i..][..3].try_into().unwrap(),
         opacity: opacity[i],
         log_scale: scale[3 * i..][..3].try_into().unwrap(),
@@ -114,9 +114,9 @@ fn golden_values_of_pytorch() {
     assert_eq!(data.images[..data.n_pixels()], f32s("image/0"), "images that go from 0 to 1 stay");
     let mut fit = XTrainer::with(&gpu, data, &config, &state, 0).unwrap();
     let shown = golden.case["shown"].as_array().unwrap().iter();
-    let turns: Vec<R2Turn> =
-        shown.map(|image| R2Turn { image: image.as_u64().unwrap() as u32, ..R2Turn::default() }).collect();
-    gpu.upload(&fit.buffers().0.r2_turns, 0, &turns).unwrap();
+    let turns: Vec<PictureTurn> =
+        shown.map(|image| PictureTurn { image: image.as_u64().unwrap() as u32, ..PictureTurn::default() }).collect();
+    gpu.upload(&fit.buffers().0.picture_turns, 0, &turns).unwrap();
     let (loss, gradient) = twin(&fit, &turns[..1], &with_sets(&state));
     let want_loss: f64 = golden.get("terms").iter().sum();
     assert!((loss / want_loss - 1.0).abs() < 1e-6, "{loss} against {want_loss}");
@@ -211,7 +211,7 @@ fn a_fit_shows_discs_that_hide_each_other_and_models_draw_what_fits_see() {
         let (anchor, direction) = dataset.views[image].rays.pixel((pixel % 33) as f64, (pixel / 33) as f64);
         let sum = |depth: f64| -> f64 {
             let at = 100.0 * (anchor + depth * direction);
-            let of = |g: &XGaussian| {
+            let of = |g: &BlendGaussian| {
                 let away = g.axes().transpose() * (at - g.centre()) / g.scales();
                 g.shown_opacity() * (-0.5 * away.length_squared()).exp()
             };
@@ -298,9 +298,14 @@ fn lists_that_outgrow_their_room_get_more_and_nothing_is_lost() {
         assert!(got.2 > capacity, "{}", got.2);
     }
     // The device has no buffer of this size.
-    let error = nertca_vk::gaussians::blending::picture::more_capacity(1001, 1000, ("x.max_gaussians", 7))
-        .unwrap_err()
-        .to_string();
+    let error = nertca_vk::gaussians::blending::picture::more_capacity(
+        1001,
+        1000,
+        ("x.max_gaussians", 7),
+        "a larger x.interval",
+    )
+    .unwrap_err()
+    .to_string();
     assert!(error.contains("1001") && error.contains("x.interval"), "{error}");
     expect_silence(gpu);
 }

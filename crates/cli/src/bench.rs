@@ -8,7 +8,7 @@ use nertca_vk::bench::peaks::peaks;
 use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
 use nertca_vk::config::sections::Train;
-use nertca_vk::config::{Config, GaussianForm, Preset};
+use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::fitting::ledger::Ledger;
 use nertca_vk::gpu::device::Gpu;
@@ -190,7 +190,7 @@ fn measure(
 ) -> Result<Report> {
     let dry_run = args.full.then(|| dry_run_of(global, gpu, config, dataset)).transpose()?;
     let tuning = global.training_tuning(gpu, config, dataset)?;
-    let timings = match config.gaussians.form != GaussianForm::None {
+    let timings = match methods::of(config).abilities.time_gaussians.is_some() {
         true => time_gaussians(args, gpu, config, dataset, &tuning)?,
         false => time_network(args, gpu, config, dataset, &tuning)?,
     };

@@ -156,19 +156,12 @@ pub fn print(report: &Report, kernels: bool) {
     }
 }
 
-/// Forms of the Gaussians whose number grows after the timed iterations.
-const GROWING: [&str; 2] = ["r2", "x"];
-
 fn print_whole_run(report: &Report) {
     let (time, speedup) = (clock(report.whole_run_s), PAPER_SECONDS / report.whole_run_s);
     if report.of_the_paper {
         out!("whole run, extrapolated: {time}; the paper needs 37:00, so this is {speedup:.3} x as fast");
     } else {
-        let min = if report.gaussians.as_ref().is_some_and(|g| GROWING.contains(&g.form.as_str())) {
-            "at least "
-        } else {
-            ""
-        };
+        let min = if report.gaussians.as_ref().is_some_and(|timing| timing.grows) { "at least " } else { "" };
         out!(
             "whole run, extrapolated: {min}{time}; its iterations differ from the paper's, so a comparison with the \
              paper's 37:00 needs a Dice (--full)"

@@ -34,7 +34,7 @@ pub fn run(args: &CheckArgs) -> Result<()> {
         print(&dataset, &found)?;
     }
     if let Some(directory) = &args.pictures {
-        match Plan::new(&Config::preset(Preset::Fast), &dataset)?.hull {
+        match Plan::new(&Config::preset(Preset::default()), &dataset)?.hull {
             Some(hull) => hull_pictures::write(directory, &dataset, &hull)?,
             None => eprintln!("no pictures were written: no motion is consistent between the views"),
         }
@@ -75,7 +75,7 @@ fn print(dataset: &Dataset, found: &Check) -> Result<()> {
     }
     found.warnings.iter().for_each(|w| out!("warning: {w}"));
     if !found.faulty() {
-        let config = Config::preset(Preset::Fast);
+        let config = Config::preset(Preset::default());
         calibrate(dataset, config.calibration())?.notes.iter().for_each(|note| out!("{note}"));
         out!("{}", found.conclusion());
     }

@@ -7,7 +7,7 @@ use clap::Args;
 use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
-use nertca_vk::export::motion::{MotionExport, MotionFormat, deformable_set, write_trajectories};
+use nertca_vk::export::motion::{MotionExport, MotionFormat, moving_set, write_trajectories};
 use nertca_vk::export::segmentation::{self, Segmentation, SegmentationSeeds};
 use nertca_vk::export::splats::write_splats;
 use nertca_vk::export::surfaces::{MeshFormat, write_meshes};
@@ -261,7 +261,7 @@ fn no_volume(out: &Path) -> Error {
 
 /// Exports displacements, or the paths of the Gaussians; needs no device.
 fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: bool) -> Result<()> {
-    let tree = deformable_set(model)?;
+    let tree = moving_set(model)?;
     let format = MotionFormat::of(&args.out);
     let unknown = |known: &str| Error::config("--out", args.out.display(), format!("does not end in one of {known}"));
     let made = if args.trajectories {
@@ -274,7 +274,7 @@ fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: b
         let encoding = if args.compress { Encoding::Gzip } else { Encoding::Raw };
         let format = format.ok_or_else(|| unknown(".nrrd .vtk"))?;
         let earlier = earlier(args, format == MotionFormat::Vtk && sequence)?;
-        let made = MotionExport { deformable: tree, phases, sequence, format, encoding }.write(&args.out)?;
+        let made = MotionExport { moving: tree, phases, sequence, format, encoding }.write(&args.out)?;
         earlier.make_way(&made)?;
         made
     };

@@ -3,10 +3,9 @@
 use super::geometry_picture;
 use clap::Args;
 use nertca_vk::checkpoint::{self, Checkpoint};
-use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::{path_in_json, pretty_json};
-use nertca_vk::gaussians::field::DynamicGaussians;
+use nertca_vk::gaussians::field::GaussianField;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::scan::dataset::{Dataset, Split, manifest_schema};
 use nertca_vk_vessels::score::pictures::Window;
@@ -83,16 +82,16 @@ fn describe_run(path: &Path) -> Result<serde_json::Value> {
 #[derive(Serialize)]
 struct Stored<'a>(#[serde(serialize_with = "path_in_json::serialize")] &'a Path);
 
-fn describe_gaussians(field: &DynamicGaussians) -> serde_json::Value {
+fn describe_gaussians(field: &GaussianField) -> serde_json::Value {
     let phases = 0..field.rows().n_phases;
-    let filled = field.deformable().filter(|set| set.filling.is_some());
+    let filled = field.moving().filter(|set| set.filling.is_some());
     serde_json::json!({
-        "form": field.form().name(),
+        "form": field.form(),
         "count": field.rows().rows.len(),
         "bytes": field.bytes(),
-        "rest_phase": field.deformable().map(|set| set.setup.rest_phase),
+        "rest_phase": field.moving().map(|set| set.setup.rest_phase),
         "filled_share": filled.map(|set| phases.clone().map(|p| set.filled_share(p)).collect::<Vec<_>>()),
-        "displacement_from_phase_0": field.deformable().map(|set| phases.map(|p| set.displacement(p as f64)).collect::<Vec<_>>()),
+        "displacement_from_phase_0": field.moving().map(|set| phases.map(|p| set.displacement(p as f64)).collect::<Vec<_>>()),
     })
 }
 

@@ -6,7 +6,7 @@ use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::check::Verdict;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::Result;
-use nertca_vk::gaussians::field::DynamicGaussians;
+use nertca_vk::gaussians::field::GaussianField;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::model::Model;
@@ -86,7 +86,7 @@ impl Report<'_> {
             facts.push(("training".into(), format!("{s:.1} s; the paper: 2220 s on an RTX A5000")));
         }
         let frames = dataset.validation().iter();
-        let tree = model.gaussians.as_ref().and_then(DynamicGaussians::deformable);
+        let tree = model.gaussians.as_ref().and_then(GaussianField::moving);
         let of_views = |file: fn(&Path, usize) -> PathBuf| {
             let files = dataset.training_views().into_iter().map(|view| (view, file(&run.join("report"), view)));
             files.filter(|(_, file)| file.is_file()).collect()
@@ -176,17 +176,17 @@ fn numbers_of(checked: &Value) -> Option<(String, String)> {
     Some(("agreement".into(), text))
 }
 
-fn gaussians_of(field: &DynamicGaussians) -> String {
+fn gaussians_of(field: &GaussianField) -> String {
     let form = match field {
-        DynamicGaussians::PerPhase(_) => "one set per phase",
-        DynamicGaussians::Deformable(_) => "one deformable set",
+        GaussianField::PerPhase(_) => "one set per phase",
+        GaussianField::Moving(_) => "one deformable set",
     };
     let kib = field.bytes() as f64 / 1024.0;
     let agreement = field.rows().agreement.as_ref().map_or(String::new(), |fits| {
         let percent = 100.0 * fits.overall;
         format!(", the mean of several fits; {percent:.0} % of the vessels of one fit lie in those of another")
     });
-    let (n, name) = (field.rows().rows.len(), field.form().name());
+    let (n, name) = (field.rows().rows.len(), field.form());
     format!("{n}, {form} (gaussians.form = \"{name}\"), {kib:.0} KiB{agreement}")
 }
 

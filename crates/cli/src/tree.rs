@@ -167,7 +167,7 @@ fn in_words(lesion: &Lesion, over_beat: &[f64]) -> String {
 /// Returns the phases in which vessels must be found for the trees of some phases: all, where points are followed, because their radii are
 /// measured in the images of all phases together.
 fn phases_to_find(model: &Model, phases: &[u32]) -> Vec<u32> {
-    let follows = model.gaussians.as_ref().is_some_and(|gaussians| gaussians.deformable().is_some());
+    let follows = model.gaussians.as_ref().is_some_and(|gaussians| gaussians.moving().is_some());
     if follows { (0..model.shown_phases()).collect() } else { phases.to_vec() }
 }
 

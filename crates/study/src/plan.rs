@@ -133,10 +133,7 @@ const NEW_AND_AS_BEFORE: [(&str, &str); 6] = [
     ("[dynamic]", "occlusion_region = \"depth-range\""),
 ];
 
-/// Values that were renamed after results were first recorded: section, line now, line before.
-const RENAMED: [(&str, &str, &str); 1] = [("[gaussians]", "form = \"deformable\"", "form = \"deformable\"")];
-
-/// Removes newer settings from a configuration where they change nothing, and gives renamed values their earlier names. Results
+/// Removes newer settings from a configuration where they change nothing, and gives renamed settings their earlier names. Results
 /// recorded before thus keep their fingerprint.
 fn as_before(configuration: &str) -> String {
     let mut section = "";
@@ -151,10 +148,8 @@ fn as_before(configuration: &str) -> String {
             kept.push_str(&line.replacen(key, before, 1));
             continue;
         }
-        match RENAMED.iter().find(|(at, now, _)| (*at, *now) == (section, text)) {
-            Some((_, now, before)) => kept.push_str(&line.replace(now, before)),
-            None if NEW_AND_AS_BEFORE.contains(&(section, text)) => {}
-            None => kept.push_str(line),
+        if !NEW_AND_AS_BEFORE.contains(&(section, text)) {
+            kept.push_str(line);
         }
     }
     kept
@@ -174,8 +169,6 @@ mod tests {
         let (affine, exact) = (of(&["r2.integral=affine"]), of(&["r2.integral=exact"]));
         assert_eq!(as_before(&affine).lines().count() + 6, affine.lines().count());
         assert_eq!(as_before(&exact).lines().count() + 5, exact.lines().count());
-        let deformable = "[gaussians]\nform = \"deformable\"\n";
-        assert_eq!(as_before(deformable), "[gaussians]\nform = \"deformable\"\n");
         // In another section, the same line is another setting.
         let other = "[x]\nintegral = \"affine\"\n";
         assert_eq!(as_before(other), other);

@@ -22,7 +22,6 @@ pub mod repeats;
 pub mod sax_nerf;
 pub mod x_gaussian;
 
-use crate::config::Preset;
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::kernels::push::{self, PushConstants};
@@ -31,6 +30,7 @@ use crate::kernels::tuning::{Layers, MatrixTuning, Tuning};
 use crate::scan::dataset::Dataset;
 use crate::scan::small::{small_dataset, uneven_dataset};
 use compare::{Findings, Row};
+use problems::{FAST_NETWORK, PAPER_NETWORK, PUBLIC_NETWORK, TWO_NETWORKS};
 use serde::Serialize;
 use std::time::Instant;
 
@@ -110,7 +110,7 @@ fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuni
         networks::CASES.iter().try_for_each(|case| networks::compare(gpu, dataset, case, tuning, findings))
     };
     let views = move |findings: &mut Findings| {
-        let presets = [Preset::Paper, Preset::PublicCode, Preset::FastMlp, Preset::NerfCa];
+        let presets = [PAPER_NETWORK, PUBLIC_NETWORK, FAST_NETWORK, TWO_NETWORKS];
         presets.into_iter().try_for_each(|preset| drawing::compare_views(gpu, preset, tuning, findings))
     };
     let mut parts: Vec<TestPart<'a>> = vec![
@@ -141,9 +141,17 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<TestPart<'a>> {
         ("SAX-NeRF".into(), Box::new(move |findings| sax_nerf::compare(gpu, findings))),
         ("a deformable set of Gaussians".into(), Box::new(move |findings| dynamic_gaussians::compare(gpu, findings))),
         ("views of Gaussians".into(), Box::new(move |findings| blobs::compare_rays(gpu, tuning, findings))),
-        ("views of many Gaussians".into(), Box::new(move |findings| blobs::compare_maxima(gpu, tuning, findings))),
+        (
+            "views of many Gaussians".into(),
+            Box::new(move |findings| {
+                blobs::compare_maxima(gpu, &methods::r2_gaussian::selftest::small_config(&[])?, tuning, findings)
+            }),
+        ),
         ("volumes of Gaussians".into(), Box::new(move |findings| blobs::compare_cells(gpu, tuning, findings))),
-        ("equal runs of Gaussians".into(), Box::new(move |findings| repeats::compare_gaussians(gpu, findings))),
+        (
+            "equal runs of Gaussians".into(),
+            Box::new(move |findings| methods::dynamic_gaussians::selftest::compare_equal_runs(gpu, findings)),
+        ),
         ("projections of volumes".into(), Box::new(move |findings| projections::compare(gpu, findings))),
     ]
 }

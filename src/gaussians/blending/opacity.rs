@@ -1,9 +1,9 @@
 //! Opacities, scales and axes of Gaussians of which nearer ones hide those behind them, from the numbers that are stored.
 
-use crate::kernels::layout::XGaussian;
+use crate::kernels::layout::BlendGaussian;
 use glam::{DMat3, DQuat, DVec3};
 
-impl XGaussian {
+impl BlendGaussian {
     /// Returns the opacity at the centre.
     pub fn shown_opacity(&self) -> f64 {
         1.0 / (1.0 + (-f64::from(self.opacity)).exp())

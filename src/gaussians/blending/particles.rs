@@ -4,12 +4,12 @@ use crate::error::Result;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::kernels::dispatch::{Binding, buffer_set};
-use crate::kernels::layout::{Splat, XGaussian, XKey, XSet, XSpan};
+use crate::kernels::layout::{BlendGaussian, BlendKey, BlendSet, BlendSpan, Splat};
 use crate::kernels::push::{self, PushConstants};
 
 /// Number of keys of a block of the sort.
-const KEYS_OF_BLOCK: u32 = 16 * push::XSortCount::LOCAL_SIZE;
-const _: () = assert!(push::XSortMove::LOCAL_SIZE == push::XSortCount::LOCAL_SIZE);
+const KEYS_OF_BLOCK: u32 = 16 * push::BlendSortCount::LOCAL_SIZE;
+const _: () = assert!(push::BlendSortMove::LOCAL_SIZE == push::BlendSortCount::LOCAL_SIZE);
 /// Blocks of the sort of `n` keys.
 pub fn sort_blocks(n: u32) -> u32 {
     n.div_ceil(KEYS_OF_BLOCK)
@@ -21,24 +21,24 @@ const DIGITS: u64 = 16;
 buffer_set! {
     /// Gaussians, how they are seen, and their order.
     pub struct BlendedGaussians {
-        /// [`XGaussian`]s.
-        x_gaussians,
+        /// [`BlendGaussian`]s.
+        blend_gaussians,
         /// The set of each.
-        x_set_of,
-        /// [`XSet`]s.
-        x_sets,
+        blend_set_of,
+        /// [`BlendSet`]s.
+        blend_sets,
         /// [`Splat`]s.
         splats,
-        /// [`XSpan`]s.
-        x_spans,
-        /// [`XKey`]s.
-        x_keys,
-        /// [`XKey`]s that a pass of the sort writes.
-        x_keys_moved,
+        /// [`BlendSpan`]s.
+        blend_spans,
+        /// [`BlendKey`]s.
+        blend_keys,
+        /// [`BlendKey`]s that a pass of the sort writes.
+        blend_keys_moved,
         /// `[digit][block]`: counts of the sort.
-        x_sort_counts,
+        blend_sort_counts,
         /// Gaussians in the lists of all tiles.
-        x_list_items,
+        blend_list_items,
     }
 }
 
@@ -47,24 +47,30 @@ impl BlendedGaussians {
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
-    pub fn new(gpu: &Gpu, rows: &[XGaussian], sets: &[u32], n_sets: usize, capacity: u32) -> Result<BlendedGaussians> {
+    pub fn new(
+        gpu: &Gpu,
+        rows: &[BlendGaussian],
+        sets: &[u32],
+        n_sets: usize,
+        capacity: u32,
+    ) -> Result<BlendedGaussians> {
         let n = rows.len() as u64;
         let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
-        let mut places = vec![XSet::default(); n_sets];
+        let mut places = vec![BlendSet::default(); n_sets];
         sets.iter().for_each(|set| places[*set as usize].count += 1);
         for set in 1..n_sets {
             places[set].first = places[set - 1].first + places[set - 1].count;
         }
         Ok(BlendedGaussians {
-            x_gaussians: gpu.buffer_with("x_gaussians", rows)?,
-            x_set_of: gpu.buffer_with("x_set_of", sets)?,
-            x_sets: gpu.buffer_with("x_sets", &places)?,
+            blend_gaussians: gpu.buffer_with("blend_gaussians", rows)?,
+            blend_set_of: gpu.buffer_with("blend_set_of", sets)?,
+            blend_sets: gpu.buffer_with("blend_sets", &places)?,
             splats: new(Binding::splats, size_of::<Splat>() as u64 * n)?,
-            x_spans: new(Binding::x_spans, size_of::<XSpan>() as u64 * n)?,
-            x_keys: new(Binding::x_keys, size_of::<XKey>() as u64 * n)?,
-            x_keys_moved: new(Binding::x_keys_moved, size_of::<XKey>() as u64 * n)?,
-            x_sort_counts: new(Binding::x_sort_counts, 4 * DIGITS * u64::from(sort_blocks(rows.len() as u32)))?,
-            x_list_items: lists(gpu, capacity)?,
+            blend_spans: new(Binding::blend_spans, size_of::<BlendSpan>() as u64 * n)?,
+            blend_keys: new(Binding::blend_keys, size_of::<BlendKey>() as u64 * n)?,
+            blend_keys_moved: new(Binding::blend_keys_moved, size_of::<BlendKey>() as u64 * n)?,
+            blend_sort_counts: new(Binding::blend_sort_counts, 4 * DIGITS * u64::from(sort_blocks(rows.len() as u32)))?,
+            blend_list_items: lists(gpu, capacity)?,
         })
     }
 
@@ -73,11 +79,11 @@ impl BlendedGaussians {
     /// # Errors
     /// As [`BlendedGaussians::new`].
     pub fn make_room(&mut self, gpu: &Gpu, capacity: u32) -> Result<()> {
-        self.x_list_items = lists(gpu, capacity)?;
+        self.blend_list_items = lists(gpu, capacity)?;
         Ok(())
     }
 }
 
 fn lists(gpu: &Gpu, capacity: u32) -> Result<Buffer> {
-    Ok(gpu.buffer(Binding::x_list_items.name(), 4 * u64::from(capacity), Memory::Device)?)
+    Ok(gpu.buffer(Binding::blend_list_items.name(), 4 * u64::from(capacity), Memory::Device)?)
 }

@@ -11,7 +11,9 @@ use crate::geometry::{MM_PER_UNIT, ViewRays};
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
-use crate::kernels::layout::{Gaussian, GaussianSetup, R2Turn, XCounts, XEnd, XGaussian, XList, XSetup};
+use crate::kernels::layout::{
+    BlendCounts, BlendEnd, BlendGaussian, BlendList, BlendSetup, Gaussian, GaussianSetup, PictureTurn,
+};
 
 /// A unit of pictures in fixed point.
 pub fn unit() -> f32 {
@@ -28,15 +30,16 @@ pub fn first_capacity(n: u32, limit: u32) -> u32 {
     (FIRST_ENTRIES * n.max(256)).min(limit)
 }
 
-/// Room for lists that need more than there was. `asked` is the setting or size that they follow from, and its value.
+/// Room for lists that need more than there was. `asked` is the setting or size that they follow from, and its value; `remedy` makes them
+/// shorter.
 ///
 /// # Errors
 /// [`Error::Config`] where the device has no buffer so large.
-pub fn more_capacity(needed: u32, limit: u32, asked: (&str, u64)) -> Result<u32> {
+pub fn more_capacity(needed: u32, limit: u32, asked: (&str, u64), remedy: &str) -> Result<u32> {
     if needed > limit {
         let problem = format!(
             "the Gaussians cover {needed} tiles of 16 x 16 pixels, and the largest buffer of this device has room for \
-             {limit}: use smaller pictures, a larger x.interval, or x.static_data = \"pooled\""
+             {limit}: use {remedy}"
         );
         let (field, value) = asked;
         return Err(Error::config(field, value, problem));
@@ -48,14 +51,14 @@ pub fn more_capacity(needed: u32, limit: u32, asked: (&str, u64)) -> Result<u32>
 pub struct BlendedPicture {
     scene: BlendBuffers,
     seen: BlendedGaussians,
-    x: XSetup,
+    x: BlendSetup,
     units: Units,
     n: u32,
 }
 
 /// Drawable form of a Gaussian of a model.
-fn drawn((g, intensity): &(Gaussian, f32)) -> XGaussian {
-    XGaussian {
+fn drawn((g, intensity): &(Gaussian, f32)) -> BlendGaussian {
+    BlendGaussian {
         position: g.position,
         opacity: stored_opacity(g.log_density.into()) as f32,
         log_scale: g.log_scale,
@@ -70,10 +73,10 @@ impl BlendedPicture {
     /// # Errors
     /// Device errors.
     pub fn new(gpu: &Gpu, field: &Gaussians, phase: usize, [width, height]: [usize; 2]) -> Result<BlendedPicture> {
-        let rows: Vec<XGaussian> = field.blended_at(phase).iter().map(drawn).collect();
+        let rows: Vec<BlendGaussian> = field.blended_at(phase).iter().map(drawn).collect();
         let n = rows.len() as u32;
         // Buffers are never empty.
-        let rows = if rows.is_empty() { vec![XGaussian::default()] } else { rows };
+        let rows = if rows.is_empty() { vec![BlendGaussian::default()] } else { rows };
         let pixels = (width * height) as u32;
         let setup = GaussianSetup {
             n_views: 1,
@@ -85,7 +88,7 @@ impl BlendedPicture {
             image_stride: pixels,
             ..GaussianSetup::default()
         };
-        let x = XSetup {
+        let x = BlendSetup {
             nearest: (NEAREST_MM / (field.units.pixel * MM_PER_UNIT)) as f32,
             n_sets: 1,
             tile_columns: (width as u32).div_ceil(TILE),
@@ -98,15 +101,15 @@ impl BlendedPicture {
         let view_bytes = size_of::<crate::kernels::layout::GaussianView>() as u64;
         let scene = BlendBuffers {
             gaussian_setup: gpu.buffer_with("gaussian_setup of a picture", &[setup])?,
-            x_setup: gpu.buffer_with("x_setup of a picture", &[x])?,
+            blend_setup: gpu.buffer_with("blend_setup of a picture", &[x])?,
             gaussian_views: gpu.buffer("gaussian_views of a picture", view_bytes, Memory::Upload)?,
-            r2_turns: gpu.buffer_with("r2_turns of a picture", &[R2Turn::default()])?,
+            picture_turns: gpu.buffer_with("picture_turns of a picture", &[PictureTurn::default()])?,
             gaussian_step: gpu.buffer_with("gaussian_step of a picture", &[0u32])?,
-            x_tile_counts: new("x_tile_counts of a picture", 4 * n_tiles)?,
-            x_counts: gpu.buffer("x_counts of a picture", size_of::<XCounts>() as u64, Memory::Readback)?,
-            x_lists: new("x_lists of a picture", size_of::<XList>() as u64 * n_tiles)?,
+            blend_tile_counts: new("blend_tile_counts of a picture", 4 * n_tiles)?,
+            blend_counts: gpu.buffer("blend_counts of a picture", size_of::<BlendCounts>() as u64, Memory::Readback)?,
+            blend_lists: new("blend_lists of a picture", size_of::<BlendList>() as u64 * n_tiles)?,
             splat_images: gpu.buffer("splat_images of a picture", 4 * u64::from(pixels), Memory::Readback)?,
-            x_ends: new("x_ends of a picture", size_of::<XEnd>() as u64 * u64::from(pixels))?,
+            blend_ends: new("blend_ends of a picture", size_of::<BlendEnd>() as u64 * u64::from(pixels))?,
         };
         let seen = BlendedGaussians::new(gpu, &rows, &vec![0; rows.len()], 1, x.capacity)?;
         Ok(BlendedPicture { scene, seen, x, units: field.units, n })
@@ -123,19 +126,20 @@ impl BlendedPicture {
             let (scene, seen, x, n) = (&self.scene, &self.seen, &self.x, self.n);
             if n == 0 {
                 recording.fill(&scene.splat_images, 0);
-                recording.fill(&scene.x_counts, 0);
+                recording.fill(&scene.blend_counts, 0);
             } else {
                 BlendPass { recording: &mut recording, kernels, scene, seen, x, n }.record()?;
             }
             gpu.wait(recording.finish()?.submit()?)?;
-            let mut counts = [XCounts::default()];
-            scene.x_counts.read(&mut counts)?;
+            let mut counts = [BlendCounts::default()];
+            scene.blend_counts.read(&mut counts)?;
             if counts[0].entries <= self.x.capacity {
                 return Ok(&self.scene.splat_images);
             }
             let columns = u64::from(self.x.tile_columns * TILE);
-            self.x.capacity = more_capacity(counts[0].entries, capacity_limit(gpu), ("size", columns))?;
-            gpu.upload(&self.scene.x_setup, 0, &[self.x])?;
+            self.x.capacity =
+                more_capacity(counts[0].entries, capacity_limit(gpu), ("size", columns), "smaller pictures")?;
+            gpu.upload(&self.scene.blend_setup, 0, &[self.x])?;
             self.seen.make_room(gpu, self.x.capacity)?;
         }
     }

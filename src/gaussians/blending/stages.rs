@@ -1,13 +1,13 @@
 //! The stages that draw Gaussians of which nearer ones hide those behind them, what they bind, and a picture of each set:
 //!
-//! x_project -> (x_sort_count -> x_sort_scan -> x_sort_move) of each four bits -> x_lists -> x_blend
+//! blend_project -> (blend_sort_count -> blend_sort_scan -> blend_sort_move) of each four bits -> blend_lists -> blend_picture
 
 use crate::error::Result;
 use crate::gaussians::blending::particles::{BlendedGaussians, sort_blocks};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set, dispatch_finding};
-use crate::kernels::layout::XSetup;
+use crate::kernels::layout::BlendSetup;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage, along_two_axes};
 
@@ -26,17 +26,17 @@ fn sort_passes(n_sets: u32) -> u32 {
 /// Pipelines of pictures.
 pub struct BlendKernels {
     /// Projection of each Gaussian.
-    pub project: Stage<push::XProject>,
+    pub project: Stage<push::BlendProject>,
     /// Sort, first pass.
-    pub sort_count: Stage<push::XSortCount>,
+    pub sort_count: Stage<push::BlendSortCount>,
     /// Sort, second pass.
-    pub sort_scan: Stage<push::XSortScan>,
+    pub sort_scan: Stage<push::BlendSortScan>,
     /// Sort, last pass.
-    pub sort_move: Stage<push::XSortMove>,
+    pub sort_move: Stage<push::BlendSortMove>,
     /// Gaussians of each tile.
-    pub lists: Stage<push::XLists>,
+    pub lists: Stage<push::BlendLists>,
     /// Pictures.
-    pub blend: Stage<push::XBlend>,
+    pub blend: Stage<push::BlendPicture>,
 }
 
 impl BlendKernels {
@@ -62,24 +62,24 @@ buffer_set! {
     pub struct BlendBuffers {
         /// [`crate::kernels::layout::GaussianSetup`].
         gaussian_setup,
-        /// [`XSetup`].
-        x_setup,
+        /// [`BlendSetup`].
+        blend_setup,
         /// [`crate::kernels::layout::GaussianView`] of each image.
         gaussian_views,
-        /// `[iteration][set]`: [`crate::kernels::layout::R2Turn`]s.
-        r2_turns,
+        /// `[iteration][set]`: [`crate::kernels::layout::PictureTurn`]s.
+        picture_turns,
         /// Iterations done.
         gaussian_step,
         /// `[set][tile row][tile column]`: Gaussians that may show.
-        x_tile_counts,
-        /// [`crate::kernels::layout::XCounts`].
-        x_counts,
-        /// `[set][tile row][tile column]`: [`crate::kernels::layout::XList`]s.
-        x_lists,
+        blend_tile_counts,
+        /// [`crate::kernels::layout::BlendCounts`].
+        blend_counts,
+        /// `[set][tile row][tile column]`: [`crate::kernels::layout::BlendList`]s.
+        blend_lists,
         /// `[set][pixel]`: pictures in fixed point.
         splat_images,
-        /// `[set][pixel]`: [`crate::kernels::layout::XEnd`]s.
-        x_ends,
+        /// `[set][pixel]`: [`crate::kernels::layout::BlendEnd`]s.
+        blend_ends,
     }
 }
 
@@ -94,13 +94,13 @@ pub struct BlendPass<'a> {
     /// The Gaussians.
     pub seen: &'a BlendedGaussians,
     /// Constants on the host.
-    pub x: &'a XSetup,
+    pub x: &'a BlendSetup,
     /// Number of Gaussians of all sets.
     pub n: u32,
 }
 
 /// A workgroup per tile of all pictures.
-pub fn tiles(x: &XSetup) -> Groups<'static> {
+pub fn tiles(x: &BlendSetup) -> Groups<'static> {
     Groups::Direct([x.tile_columns, x.tile_rows, x.n_sets])
 }
 
@@ -114,12 +114,12 @@ impl BlendPass<'_> {
     ) -> Result<()> {
         let (scene, seen) = (self.scene, self.seen);
         let find = |name| scene.find(name).or_else(|| seen.find(name));
-        let (from, to) = if keys[0] == Binding::x_keys {
-            (&seen.x_keys, &seen.x_keys_moved)
+        let (from, to) = if keys[0] == Binding::blend_keys {
+            (&seen.blend_keys, &seen.blend_keys_moved)
         } else {
-            (&seen.x_keys_moved, &seen.x_keys)
+            (&seen.blend_keys_moved, &seen.blend_keys)
         };
-        let bound = [(Binding::x_keys, from.into()), (Binding::x_keys_moved, to.into())];
+        let bound = [(Binding::blend_keys, from.into()), (Binding::blend_keys_moved, to.into())];
         dispatch_finding(self.recording, stage, groups, &bound, find, push)
     }
 
@@ -129,24 +129,24 @@ impl BlendPass<'_> {
     /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
     pub fn record(&mut self) -> Result<()> {
         let (kernels, n, n_sets) = (self.kernels, self.n, self.x.n_sets);
-        let mut keys = [Binding::x_keys, Binding::x_keys_moved];
-        self.recording.fill(&self.scene.x_tile_counts, 0);
-        self.recording.fill(&self.scene.x_counts, 0);
-        let push = push::XProject { n_gaussians: n };
+        let mut keys = [Binding::blend_keys, Binding::blend_keys_moved];
+        self.recording.fill(&self.scene.blend_tile_counts, 0);
+        self.recording.fill(&self.scene.blend_counts, 0);
+        let push = push::BlendProject { n_gaussians: n };
         self.run(&kernels.project, kernels.project.groups_over(n), keys, push)?;
         let n_blocks = sort_blocks(n);
         for pass in 0..sort_passes(n_sets) {
             let shift = BITS_OF_PASS * pass;
-            let push = push::XSortCount { n_keys: n, n_blocks, shift };
+            let push = push::BlendSortCount { n_keys: n, n_blocks, shift };
             self.run(&kernels.sort_count, along_two_axes(n_blocks), keys, push)?;
-            let push = push::XSortScan { n_counts: DIGITS * n_blocks };
+            let push = push::BlendSortScan { n_counts: DIGITS * n_blocks };
             self.run(&kernels.sort_scan, Groups::Direct([1, 1, 1]), keys, push)?;
-            let push = push::XSortMove { n_keys: n, n_blocks, shift };
+            let push = push::BlendSortMove { n_keys: n, n_blocks, shift };
             self.run(&kernels.sort_move, along_two_axes(n_blocks), keys, push)?;
             keys.reverse();
         }
-        self.run(&kernels.lists, tiles(self.x), keys, push::XLists {})?;
-        self.run(&kernels.blend, tiles(self.x), keys, push::XBlend {})
+        self.run(&kernels.lists, tiles(self.x), keys, push::BlendLists {})?;
+        self.run(&kernels.blend, tiles(self.x), keys, push::BlendPicture {})
     }
 }
 

@@ -15,7 +15,7 @@ use crate::evidence::ratios::ViewEvidence;
 use crate::evidence::series::Series;
 use crate::fields::scale::dynamic_half;
 use crate::fitting::fit::{AdjustTask, AdjustedFit, MadeFit, Observe};
-use crate::gaussians::field::{DeformableGaussians, DynamicGaussians};
+use crate::gaussians::field::{GaussianField, MovingGaussians};
 use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::data::SOFT_HULL_CELLS;
 use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Earlier};
@@ -154,7 +154,7 @@ impl Adjuster<'_> {
     /// Finds poses in cycles of a fit and a step of the poses.
     fn found(&mut self, start: Poses, observe: &mut Observe<'_>) -> Result<Option<Poses>> {
         let (mut poses, mut number) = (start, 0);
-        let mut earlier: Option<DeformableGaussians> = None;
+        let mut earlier: Option<MovingGaussians> = None;
         for stage in &STAGES {
             let (first, end) = (number + 1, number + stage.cycles);
             while number < end {
@@ -209,7 +209,7 @@ impl Adjuster<'_> {
         let start = Start { earlier: None, end: self.config.gaussians.iterations, prunes: true };
         let fit = self.fit(dataset, self.config, start, proceed)?;
         let Some(Fitted { mut trainer, losses, fingerprint }) = fit else { return Ok(None) };
-        let gaussians = DynamicGaussians::Deformable(trainer.deformable()?);
+        let gaussians = GaussianField::Moving(trainer.deformable()?);
         let misfit = misfit(trainer.targets(), &trainer.images()?);
         let findings = trainer.take_findings();
         Ok(Some((misfit, MadeGaussians { gaussians, losses, findings, fingerprint })))

@@ -2,7 +2,7 @@
 //! by their motion, because other thin structures that rest, such as edges of bones, look the same in the images; a part that is thinner than
 //! the vessels is none.
 
-use crate::gaussians::field::{DeformableGaussians, mass};
+use crate::gaussians::field::{MovingGaussians, mass};
 use crate::geometry::MM_PER_UNIT;
 use crate::methods::dynamic_gaussians::linked::{extent, groups, grown};
 use glam::DVec3;
@@ -41,7 +41,7 @@ pub struct Catheter {
 
 impl Catheter {
     /// Finds the catheter of a deformable set with `factor` pixels of the images per pixel of the settings; none without one.
-    pub fn find(set: &DeformableGaussians, factor: f64) -> Option<Catheter> {
+    pub fn find(set: &MovingGaussians, factor: f64) -> Option<Catheter> {
         let points = Points::new(set);
         let slow: Vec<usize> = (0..points.places.len()).filter(|i| points.motion[*i] < SLOW).collect();
         let is_catheter = |part: &Vec<usize>| {
@@ -87,7 +87,7 @@ fn by_median(values: Vec<f64>) -> Vec<f64> {
 }
 
 impl Points {
-    fn new(set: &DeformableGaussians) -> Points {
+    fn new(set: &MovingGaussians) -> Points {
         let phases = set.rest.n_phases;
         let of = |i: usize| {
             let places: Vec<DVec3> = (0..phases).map(|phase| set.position(i, phase as f64)).collect();
@@ -121,14 +121,14 @@ impl Points {
 mod tests {
     use super::*;
     use crate::gaussians::field::{Gaussians, Units};
-    use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
+    use crate::kernels::layout::{Gaussian, GaussianSetup, MotionGridSetup};
 
     const PHASES: usize = 8;
     /// Number of Gaussians of the vessel, one per pixel along x.
     const VESSEL: usize = 80;
 
     /// A vessel along x, which moves along y by `motion` of its position, in front of a `line` of Gaussians with their motions.
-    fn set(motion: impl Fn(f64) -> f64, line: &[(DVec3, f64)]) -> DeformableGaussians {
+    fn set(motion: impl Fn(f64) -> f64, line: &[(DVec3, f64)]) -> MovingGaussians {
         let vessel = (0..VESSEL).map(|i| (DVec3::X * i as f64, motion(i as f64 / VESSEL as f64)));
         let all: Vec<(DVec3, f64)> = vessel.chain(line.iter().copied()).collect();
         let row = |(place, _): &(DVec3, f64)| Gaussian { position: place.as_vec3().to_array(), ..Gaussian::default() };
@@ -142,16 +142,16 @@ mod tests {
             agreement: None,
             intensities: None,
         };
-        let setup = DeformableSetup {
+        let setup = MotionGridSetup {
             n_nodes: 2,
             half_side: 100.0,
             inverse_step: 0.005,
             n_basis: 2,
-            ..DeformableSetup::default()
+            ..MotionGridSetup::default()
         };
         // Own motion with one harmonic: its cosine and its sine.
         let own = all.iter().flat_map(|(_, motion)| [[0.0; 4], [0.0, *motion as f32, 0.0, 0.0]]).collect();
-        DeformableGaussians { filling: None, grid: vec![[0.0; 4]; PHASES * setup.nodes()], rest, setup, own }
+        MovingGaussians { filling: None, grid: vec![[0.0; 4]; PHASES * setup.nodes()], rest, setup, own }
     }
 
     /// A line from the ostium, the first Gaussian of the vessel, whose motion ends along it.

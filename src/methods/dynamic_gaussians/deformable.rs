@@ -6,16 +6,17 @@ use crate::error::{Error, Result};
 use crate::evidence::series::blur;
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::ring::{losses, ring};
-use crate::gaussians::field::{AGAINST_DIVERGENCE, DeformableGaussians, Gaussians, dense};
+use crate::gaussians::field::{AGAINST_DIVERGENCE, Gaussians, MovingGaussians, dense};
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers};
 use crate::gaussians::view::SplatView;
 use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
-use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup, GaussianView};
+use crate::kernels::layout::{Gaussian, GaussianSetup, GaussianView, MotionGridSetup};
 use crate::methods::dynamic_gaussians::catheter::Catheter;
 use crate::methods::dynamic_gaussians::filling::{Filling, FillingBuffers, from_set_of_phase};
+use crate::methods::dynamic_gaussians::groups::vessels;
 use crate::methods::dynamic_gaussians::members::{MemberBuffers, Members};
 use crate::methods::dynamic_gaussians::per_phase::{MAX_PASSES, check_count, strong};
 use crate::methods::dynamic_gaussians::pruning::{Judge, broad_parts, components, short_parts};
@@ -31,7 +32,6 @@ use crate::methods::dynamic_gaussians::target_buffers::{
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::methods::dynamic_gaussians::unseen::{complete, complete_phase, is_well_seen};
 use crate::methods::dynamic_gaussians::{seeds, setup};
-use crate::model::groups::vessels;
 use crate::raster::Image;
 use glam::DVec3;
 
@@ -46,7 +46,7 @@ const MOSTLY_FILLED: f64 = 0.5;
 #[derive(Clone, Copy)]
 pub struct Earlier<'a> {
     /// The field. It may have been fitted to other images of the same vessels.
-    pub field: &'a DeformableGaussians,
+    pub field: &'a MovingGaussians,
     /// Iteration at which the fit begins.
     pub step: u32,
     /// Whether Gaussians are seeded anew and only move as those of the field; otherwise the fit goes on from these.
@@ -75,7 +75,7 @@ pub struct DeformableTrainer {
 /// Setup, schedule and buffers of iterations of one kind: the joint fit of everything, or the tracking of a phase.
 pub(super) struct Fit {
     setup: GaussianSetup,
-    deformable: DeformableSetup,
+    deformable: MotionGridSetup,
     targets: TargetBuffers,
     /// Parts of the images; tracking, which works on a phase at a time, has a single one.
     parts: Vec<TargetPart>,
@@ -96,7 +96,7 @@ impl Fit {
     /// A fit of the same grid to the same images, blurred, a phase at a time.
     fn tracking(&self, gpu: &Gpu, targets: &Targets, settings: &sections::Deformable) -> Result<Fit> {
         let setup = setup::track_setup(&self.setup, settings);
-        let deformable = DeformableSetup { grid_rate: settings.track_rate as f32, ..self.deformable };
+        let deformable = MotionGridSetup { grid_rate: settings.track_rate as f32, ..self.deformable };
         let blurred = |values: &[f32]| {
             let images = values.chunks(targets.n_pixels()).flat_map(|image| {
                 let image = Image { width: targets.width, height: targets.height, values: image.to_vec() };
@@ -215,7 +215,7 @@ impl DeformableTrainer {
 
     /// Replaces all Gaussians by others of the rest phase, each of which moves and is filled as its nearest neighbour in `deformable`, a
     /// set on the grid of this fit.
-    fn replace_by(&mut self, rows: Vec<Gaussian>, deformable: &DeformableGaussians) -> Result<()> {
+    fn replace_by(&mut self, rows: Vec<Gaussian>, deformable: &MovingGaussians) -> Result<()> {
         let mut members = Members::none(self.members.filling.is_some());
         members.append(rows, deformable);
         self.replace(&members)
@@ -315,7 +315,7 @@ impl DeformableTrainer {
     }
 
     /// Constants of the grid.
-    pub fn deformable_setup(&self) -> &DeformableSetup {
+    pub fn deformable_setup(&self) -> &MotionGridSetup {
         &self.joint.deformable
     }
 
@@ -572,7 +572,7 @@ impl DeformableTrainer {
     ///
     /// # Errors
     /// [`Error::Diverged`] when a parameter is not finite; device errors.
-    pub fn deformable(&self) -> Result<DeformableGaussians> {
+    pub fn deformable(&self) -> Result<MovingGaussians> {
         let (n, deformable) = (self.n as usize, self.joint.deformable);
         let grid: Vec<[f32; 4]> =
             self.gpu.download(&self.joint.grid.motion_grid, 0, self.targets.n_phases * deformable.nodes())?;
@@ -595,7 +595,7 @@ impl DeformableTrainer {
         rest.check()?;
         let read = |buffers: &FillingBuffers| self.gpu.download(&buffers.filling, 0, n * self.targets.n_phases);
         let filling = self.members.filling.as_ref().map(read).transpose()?;
-        Ok(DeformableGaussians { rest, setup: deformable, grid, own, filling })
+        Ok(MovingGaussians { rest, setup: deformable, grid, own, filling })
     }
 
     /// Runs one iteration with a timestamp around each pass.

@@ -5,7 +5,7 @@ use crate::config::{Config, GaussianForm};
 use crate::error::{Error, Result};
 use crate::fitting::fit::{Advance, FitProgress, FitWork, Iterates, Measured};
 use crate::fitting::losses::StepLoss;
-use crate::gaussians::field::DynamicGaussians;
+use crate::gaussians::field::GaussianField;
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
@@ -130,11 +130,11 @@ impl GaussianFit {
     ///
     /// # Errors
     /// As [`GaussianTrainer::model`].
-    pub(crate) fn field(&self) -> Result<DynamicGaussians> {
+    pub(crate) fn field(&self) -> Result<GaussianField> {
         Ok(match self {
-            GaussianFit::PerPhase(fit) => DynamicGaussians::PerPhase(fit.model()?),
-            GaussianFit::Start(start, _) => DynamicGaussians::PerPhase(start.field()?),
-            GaussianFit::Deformable(fit, _) => DynamicGaussians::Deformable(fit.deformable()?),
+            GaussianFit::PerPhase(fit) => GaussianField::PerPhase(fit.model()?),
+            GaussianFit::Start(start, _) => GaussianField::PerPhase(start.field()?),
+            GaussianFit::Deformable(fit, _) => GaussianField::Moving(fit.deformable()?),
             GaussianFit::Made(fit) => fit.field().clone(),
         })
     }
@@ -158,11 +158,11 @@ impl GaussianFit {
         }
     }
 
-    /// Form of the field that it fits.
-    pub(crate) fn form(&self) -> GaussianForm {
+    /// Name of the form of the field that it fits.
+    fn form(&self) -> &'static str {
         match self {
-            GaussianFit::PerPhase(_) => GaussianForm::Phase,
-            GaussianFit::Start(..) | GaussianFit::Deformable(..) => GaussianForm::Deformable,
+            GaussianFit::PerPhase(_) => GaussianForm::Phase.name(),
+            GaussianFit::Start(..) | GaussianFit::Deformable(..) => GaussianForm::Deformable.name(),
             GaussianFit::Made(fit) => fit.field().form(),
         }
     }
@@ -216,7 +216,7 @@ impl Measured for GaussianFit {
     }
 
     fn work(&self) -> Result<Option<FitWork>> {
-        let form = Some(self.form().name());
+        let form = Some(self.form());
         Ok(Some(FitWork { form, count: self.count(), work: GaussianFit::work(self)? }))
     }
 }

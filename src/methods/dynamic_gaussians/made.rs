@@ -3,14 +3,14 @@
 
 use crate::config::Config;
 use crate::fingerprint::Fingerprint;
-use crate::gaussians::field::DynamicGaussians;
+use crate::gaussians::field::GaussianField;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
 /// A fit of Gaussians that was done before its run begins.
 #[derive(Debug, Clone)]
 pub struct MadeGaussians {
     /// The field after all iterations.
-    pub gaussians: DynamicGaussians,
+    pub gaussians: GaussianField,
     /// Loss of each iteration.
     pub losses: Vec<f64>,
     /// Findings about the data, for the user.
@@ -36,7 +36,7 @@ impl Made {
     }
 
     /// Takes a fit that is done.
-    pub(crate) fn done(gaussians: DynamicGaussians, losses: Vec<f64>) -> Made {
+    pub(crate) fn done(gaussians: GaussianField, losses: Vec<f64>) -> Made {
         let fit = MadeGaussians { gaussians, losses, findings: Vec::new(), fingerprint: String::new() };
         Made { fit, step: 0 }
     }
@@ -60,7 +60,7 @@ impl Made {
     }
 
     /// Returns the field after all iterations.
-    pub(crate) fn field(&self) -> &DynamicGaussians {
+    pub(crate) fn field(&self) -> &GaussianField {
         &self.fit.gaussians
     }
 }

@@ -2,7 +2,7 @@
 //! filling.
 
 use crate::error::Result;
-use crate::gaussians::field::DeformableGaussians;
+use crate::gaussians::field::MovingGaussians;
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gpu::device::Gpu;
 use crate::kernels::layout::{Gaussian, GaussianSetup};
@@ -34,7 +34,7 @@ impl Members {
     }
 
     /// Appends Gaussians of the rest phase, each of which moves and is filled as its nearest neighbour in a deformable set.
-    pub(super) fn append(&mut self, rows: Vec<Gaussian>, deformable: &DeformableGaussians) {
+    pub(super) fn append(&mut self, rows: Vec<Gaussian>, deformable: &MovingGaussians) {
         let (n_basis, n_phases) = (deformable.setup.n_basis as usize, deformable.rest.n_phases);
         for g in &rows {
             let nearest = deformable.nearest(DVec3::from_array(g.position.map(f64::from)));

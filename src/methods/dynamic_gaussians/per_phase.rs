@@ -11,12 +11,12 @@ use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup};
+use crate::methods::dynamic_gaussians::groups::vessels;
 use crate::methods::dynamic_gaussians::target_buffers::{
     Renewal, TargetPart, renew_bounds, take_images, undivided_targets,
 };
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::methods::dynamic_gaussians::{seeds, setup};
-use crate::model::groups::vessels;
 
 /// A run on a device.
 pub struct GaussianTrainer {

@@ -3,10 +3,10 @@
 
 use crate::gaussians::field::scales;
 use crate::kernels::layout::{Gaussian, GaussianSetup};
+use crate::methods::dynamic_gaussians::groups::breadth;
 use crate::methods::dynamic_gaussians::linked::{extent, groups};
 use crate::methods::dynamic_gaussians::remainder::remainders;
 use crate::methods::dynamic_gaussians::targets::Targets;
-use crate::model::groups::breadth;
 use crate::raster::percentile;
 use glam::DVec3;
 

@@ -2,7 +2,7 @@
 
 use crate::config::Config;
 use crate::error::{Error, Result};
-use crate::gaussians::field::DynamicGaussians;
+use crate::gaussians::field::GaussianField;
 use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::deformable::Earlier;
 use crate::methods::dynamic_gaussians::fit::GaussianFit;
@@ -66,11 +66,11 @@ pub(crate) struct Repeated {
 /// Fit that is under way, with the results of those before it.
 enum Stage {
     /// The run's fit: the only one, or its iterations again, to report them, with the mean of all fits.
-    Run { mean: Option<DynamicGaussians> },
+    Run { mean: Option<GaussianField> },
     /// The first of several fits.
     First { images: Targets, losses: Vec<f64> },
     /// One of the other fits, with the images for those after it, and the mean of those before it.
-    Other { images: Option<Targets>, first: Made, others: Vec<DynamicGaussians>, mean: DynamicGaussians },
+    Other { images: Option<Targets>, first: Made, others: Vec<GaussianField>, mean: GaussianField },
 }
 
 impl Repeated {
@@ -83,7 +83,7 @@ impl Repeated {
         gpu: &Gpu,
         targets: Targets,
         config: &Config,
-        earlier: Option<&DynamicGaussians>,
+        earlier: Option<&GaussianField>,
         made: Option<&MadeGaussians>,
     ) -> Result<Repeated> {
         let step = setup::carried_step(&config.gaussians);
@@ -95,7 +95,7 @@ impl Repeated {
         let fit = match made.and_then(|made| Made::of(made, &targets, config)) {
             Some(made) => GaussianFit::Made(Box::new(made)),
             None => {
-                let earlier = earlier.and_then(|earlier| earlier.deformable());
+                let earlier = earlier.and_then(|earlier| earlier.moving());
                 let earlier = earlier.map(|field| Earlier { field, step, reseeds: false });
                 GaussianFit::new(gpu, targets, config, earlier)?
             }
@@ -193,7 +193,7 @@ impl Repeated {
         let number = others.len() as u32 + 1;
         let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
         let left = (number + 1 < self.fits).then(|| images.clone());
-        let earlier = first.field().deformable().map(|field| Earlier { field, step: 0, reseeds: true });
+        let earlier = first.field().moving().map(|field| Earlier { field, step: 0, reseeds: true });
         self.fit = GaussianFit::new(&self.gpu, images, &Config { seed, ..self.config.clone() }, earlier)?;
         self.stage = Stage::Other { images: left, first, others, mean };
         Ok(())
@@ -203,7 +203,7 @@ impl Repeated {
     ///
     /// # Errors
     /// As [`GaussianFit::field`].
-    pub(crate) fn field(&self) -> Result<DynamicGaussians> {
+    pub(crate) fn field(&self) -> Result<GaussianField> {
         match &self.stage {
             Stage::Run { mean: Some(mean) } | Stage::Other { mean, .. } => Ok(mean.clone()),
             Stage::Run { mean: None } | Stage::First { .. } => self.fit.field(),
@@ -212,10 +212,10 @@ impl Repeated {
 }
 
 /// Returns the mean of fits; a single one as it is.
-fn mean(fields: &[DynamicGaussians]) -> Result<DynamicGaussians> {
+fn mean(fields: &[GaussianField]) -> Result<GaussianField> {
     let mean = match fields {
         [field] => Some(field.clone()),
-        fields => DynamicGaussians::mean(fields, MEAN_FACTOR),
+        fields => GaussianField::mean(fields, MEAN_FACTOR),
     };
     mean.ok_or_else(|| Error::Internal("repeated fits to the same images have different forms".into()))
 }

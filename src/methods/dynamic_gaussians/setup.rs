@@ -4,7 +4,7 @@ use crate::config::sections;
 use crate::fitting::RING_LENGTH;
 use crate::gaussians::field::inverse_step;
 use crate::gaussians::stages::{FIXED_POINT_BITS, loss_parts};
-use crate::kernels::layout::{DeformableSetup, GaussianSchedule, GaussianSetup};
+use crate::kernels::layout::{GaussianSchedule, GaussianSetup, MotionGridSetup};
 use crate::methods::dynamic_gaussians::targets::Targets;
 
 /// Decay of Adam's first and second moments, and its smallest denominator.
@@ -59,13 +59,13 @@ pub fn track_setup(setup: &GaussianSetup, settings: &sections::Deformable) -> Ga
 }
 
 /// Constants of a deformable set's grid, which encloses the hull.
-pub fn deformable_setup(targets: &Targets, settings: &sections::Deformable) -> DeformableSetup {
+pub fn deformable_setup(targets: &Targets, settings: &sections::Deformable) -> MotionGridSetup {
     let reach = targets.places.iter().flatten().map(|p| p.position.abs().max_element()).fold(0.0, f64::max);
     let half_side = reach + MARGIN;
     let n_nodes = (2.0 * half_side / settings.node).ceil() as u32 + 1;
     // Harmonics beyond half the number of phases cannot be told apart.
     let harmonics = settings.harmonics.min((targets.n_phases as u32).saturating_sub(1) / 2);
-    DeformableSetup {
+    MotionGridSetup {
         n_nodes,
         half_side: half_side as f32,
         inverse_step: inverse_step(n_nodes, half_side as f32),

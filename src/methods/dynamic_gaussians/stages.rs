@@ -9,7 +9,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::Groups;
 use crate::kernels::constants;
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
-use crate::kernels::layout::DeformableSetup;
+use crate::kernels::layout::MotionGridSetup;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
 use crate::methods::dynamic_gaussians::filling::{FILLING_RATE, FillingBuffers, MIN_FILLING};
@@ -58,7 +58,7 @@ impl DeformableKernels {
 buffer_set! {
     /// Motion that all Gaussians share: displacements of a grid.
     pub struct GridBuffers {
-        /// [`DeformableSetup`].
+        /// [`MotionGridSetup`].
         deformable_setup,
         /// `[phase][basis function]`.
         motion_basis,
@@ -78,7 +78,7 @@ impl GridBuffers {
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
-    pub fn new(gpu: &Gpu, deformable: &DeformableSetup, n_phases: usize) -> Result<GridBuffers> {
+    pub fn new(gpu: &Gpu, deformable: &MotionGridSetup, n_phases: usize) -> Result<GridBuffers> {
         let since_rest = |phase: usize| (phase as f64 - f64::from(deformable.rest_phase)) / n_phases as f64;
         let basis_at = |phase: usize| basis(deformable.n_basis as usize, since_rest(phase));
         let basis: Vec<f32> = (0..n_phases).flat_map(basis_at).map(|v| v as f32).collect();
@@ -98,7 +98,7 @@ impl GridBuffers {
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
-    pub fn under(&self, gpu: &Gpu, deformable: &DeformableSetup) -> Result<GridBuffers> {
+    pub fn under(&self, gpu: &Gpu, deformable: &MotionGridSetup) -> Result<GridBuffers> {
         Ok(GridBuffers { deformable_setup: gpu.buffer_with("deformable_setup", &[*deformable])?, ..self.clone() })
     }
 }
@@ -191,7 +191,7 @@ pub struct DeformablePass<'a> {
     /// Filling; none where vessels are full all the time.
     pub filling: Option<&'a FillingBuffers>,
     /// Constants on the host.
-    pub setup: &'a DeformableSetup,
+    pub setup: &'a MotionGridSetup,
 }
 
 impl DeformablePass<'_> {

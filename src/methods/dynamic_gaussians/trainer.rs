@@ -7,12 +7,11 @@ use crate::fitting::fit::{
 };
 use crate::fitting::ledger::Ledger;
 use crate::fitting::losses::{SMALLER_STEPS, StepLoss};
-use crate::gaussians::field::{DynamicGaussians, GaussianFeed};
+use crate::gaussians::field::{GaussianFeed, GaussianField};
 use crate::gaussians::pictures::Pictures;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
 use crate::methods::dynamic_gaussians::data::{GaussianData, Shot};
-use crate::methods::dynamic_gaussians::fit::GaussianFit;
 use crate::methods::dynamic_gaussians::repeated::Repeated;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -88,7 +87,7 @@ impl GaussiansFit {
     }
 
     /// Returns the Gaussians as they are shown now.
-    fn field(&self) -> DynamicGaussians {
+    fn field(&self) -> GaussianField {
         self.feed.lock().unwrap_or_else(PoisonError::into_inner).1.clone()
     }
 

@@ -1,7 +1,7 @@
 //! Motion of the vessels that contrast does not show at a phase. Where contrast shows a part of the vessels, the motion of this part
 //! determines a mixture of the motion at other phases; where it shows nothing, the motion follows a smooth curve through the other phases.
 
-use crate::gaussians::field::{DeformableGaussians, mass, shares, vector};
+use crate::gaussians::field::{MovingGaussians, mass, shares, vector};
 use crate::linear::Symmetric;
 use glam::DVec3;
 
@@ -15,13 +15,13 @@ const VELOCITY: f64 = 0.3;
 const RIDGE: f64 = 0.01;
 
 /// Tells whether contrast shows most of the vessels at a phase.
-pub(super) fn is_well_seen(field: &DeformableGaussians, phase: usize) -> bool {
+pub(super) fn is_well_seen(field: &MovingGaussians, phase: usize) -> bool {
     field.filled_share(phase) >= WELL_SEEN
 }
 
 /// Replaces the displacements of the grid where Gaussians are not filled, at all phases that are not seen well, beginning with those that
 /// are seen best.
-pub(super) fn complete(field: &mut DeformableGaussians) {
+pub(super) fn complete(field: &mut MovingGaussians) {
     let n_phases = field.rest.n_phases;
     let share: Vec<f64> = (0..n_phases).map(|phase| field.filled_share(phase)).collect();
     let rest_phase = field.setup.rest_phase as usize;
@@ -36,7 +36,7 @@ pub(super) fn complete(field: &mut DeformableGaussians) {
 
 /// Replaces the displacements of the grid at a phase where Gaussians are not filled, by those of the mixture of `known` phases that moves
 /// filled Gaussians as they move.
-pub(super) fn complete_phase(field: &mut DeformableGaussians, phase: usize, known: &[usize]) {
+pub(super) fn complete_phase(field: &mut MovingGaussians, phase: usize, known: &[usize]) {
     let mut weights = smooth_weights(field.rest.n_phases, known, phase);
     let places = |at: usize| (0..field.rest.rows.len()).map(|i| field.position(i, at as f64)).collect::<Vec<_>>();
     let (of_known, here) = (known.iter().map(|at| places(*at)).collect::<Vec<_>>(), places(phase));
@@ -63,7 +63,7 @@ fn certainty(filling: f64) -> f64 {
 }
 
 /// Returns for each node of the grid the share of the mass around it that is filled at a phase; 0 where no Gaussian is.
-fn seen_nodes(field: &DeformableGaussians, phase: usize) -> Vec<f64> {
+fn seen_nodes(field: &MovingGaussians, phase: usize) -> Vec<f64> {
     let mut sums = vec![[0.0; 2]; field.setup.nodes()];
     for (i, g) in field.rest.rows.iter().enumerate() {
         let (mass, filling) = (mass(g, &field.rest.setup), field.filling_at(i, phase));
@@ -139,7 +139,7 @@ fn mixture(of_known: &[Vec<DVec3>], here: &[DVec3], weights: &[f64], (certain, m
 mod tests {
     use super::*;
     use crate::gaussians::field::{Gaussians, Units, inverse_step};
-    use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
+    use crate::kernels::layout::{Gaussian, GaussianSetup, MotionGridSetup};
 
     const PHASES: usize = 10;
 
@@ -152,20 +152,20 @@ mod tests {
     }
 
     /// A vessel along x, filled at each phase up to the share of its length that `filled_to` states.
-    fn vessel(filled_to: [f64; PHASES]) -> DeformableGaussians {
+    fn vessel(filled_to: [f64; PHASES]) -> MovingGaussians {
         let (n_nodes, half_side) = (5, 40.0);
-        let setup = DeformableSetup {
+        let setup = MotionGridSetup {
             n_nodes,
             half_side,
             inverse_step: inverse_step(n_nodes, half_side),
-            ..DeformableSetup::default()
+            ..MotionGridSetup::default()
         };
         let node = |i: usize| DVec3::new((i % 5) as f64, (i / 5 % 5) as f64, (i / 25) as f64) * 20.0 - 40.0;
         let n = 61;
         let row = |i: usize| Gaussian { position: [i as f32 - 30.0, 0.2 * i as f32 - 8.0, 5.0], ..Gaussian::default() };
         let filled = |i: usize, phase: usize| if (i as f64) < filled_to[phase] * n as f64 { 1.0 } else { 0.01 };
         let pack = |v: DVec3| [v.x as f32, v.y as f32, v.z as f32, 0.0];
-        DeformableGaussians {
+        MovingGaussians {
             rest: Gaussians {
                 units: Units { pixel: 0.01, strongest: 0.5 },
                 n_phases: PHASES,
@@ -184,7 +184,7 @@ mod tests {
     }
 
     /// Largest distance of a Gaussian at a phase from where it is in truth.
-    fn error(field: &DeformableGaussians, truth: &DeformableGaussians, phase: usize) -> f64 {
+    fn error(field: &MovingGaussians, truth: &MovingGaussians, phase: usize) -> f64 {
         let of = |i: usize| field.position(i, phase as f64).distance(truth.position(i, phase as f64));
         (0..truth.rest.rows.len()).map(of).fold(0.0, f64::max)
     }

@@ -5,7 +5,7 @@ use crate::config::sections::R2;
 use crate::kernels::layout::R2Gaussian;
 use crate::methods::r2_gaussian::parameters::{ScaleBounds, softplus_inverse};
 use crate::methods::r2_gaussian::state::R2State;
-use crate::random::{STREAM_R2_CHILD, normal};
+use crate::random::{STREAM_CHILD, normal};
 use glam::DVec3;
 
 /// Factor by which the two halves of a split Gaussian are narrower.
@@ -76,7 +76,7 @@ fn shared(g: &R2Gaussian) -> f32 {
 }
 
 fn deviate(seed: u32, step: u32, row: usize, number: u32) -> f64 {
-    normal(seed.wrapping_add(step), STREAM_R2_CHILD, row as u32, number)
+    normal(seed.wrapping_add(step), STREAM_CHILD, row as u32, number)
 }
 
 /// A narrower Gaussian at a place drawn from the one that is split; `deviate` gives a standard normal number for each

@@ -5,12 +5,12 @@ use crate::config::{Config, R2Integral};
 use crate::fitting::RING_LENGTH;
 use crate::fitting::sets::seed_of_set;
 use crate::gaussians::comparison::picture_parts;
-use crate::kernels::layout::{GaussianSetup, R2Schedule, R2Setup, R2Turn};
+use crate::kernels::layout::{GaussianSetup, PictureSetup, PictureTurn, R2Schedule, R2Setup};
 use crate::methods::r2_gaussian::data::R2Data;
 use crate::methods::r2_gaussian::densify::densifies;
 use crate::methods::r2_gaussian::parameters::ScaleBounds;
 use crate::methods::r2_gaussian::stages::box_parts;
-use crate::random::{STREAM_R2_BOX, uniform01};
+use crate::random::{STREAM_BOX, uniform01};
 
 /// Half side of the square in which a Gaussian is seen, standard deviations along its longest axis.
 const CUT: f32 = 3.0;
@@ -45,13 +45,20 @@ pub fn gaussian_setup(data: &R2Data, config: &Config) -> GaussianSetup {
     }
 }
 
+/// Constants of a fit: those of all Gaussians, those of this method, and those of the comparison of pictures.
+pub type R2Setups<'a> = (&'a GaussianSetup, &'a R2Setup, &'a PictureSetup);
+
+/// Constants of the comparison of pictures.
+pub fn picture_setup(data: &R2Data, settings: &R2) -> PictureSetup {
+    PictureSetup { n_sets: data.n_sets() as u32, ssim_weight: settings.ssim as f32 }
+}
+
 /// Constants of this method.
 pub fn r2_setup(data: &R2Data, settings: &R2) -> R2Setup {
     R2Setup {
         n_sets: data.n_sets() as u32,
         box_side: settings.tv_box,
         voxel: (2.0 / f64::from(settings.voxels)) as f32,
-        ssim_weight: settings.ssim as f32,
         tv_weight: settings.tv as f32,
         tv_moves_centres: u32::from(settings.tv_moves_centres),
         exact: u32::from(settings.integral == R2Integral::Exact),
@@ -83,14 +90,17 @@ pub fn schedule(config: &Config) -> Vec<R2Schedule> {
 
 /// Turns of each set in each iteration of the schedule: an image, in an order that is drawn anew when all have been seen, and a
 /// box anywhere in the volume.
-pub fn turns(data: &R2Data, config: &Config) -> Vec<R2Turn> {
+pub fn turns(data: &R2Data, config: &Config) -> Vec<PictureTurn> {
     let r2 = &config.r2;
     let voxel = 2.0 / f64::from(r2.voxels);
     let room = 2.0 - voxel * f64::from(r2.tv_box);
     let turn = |step: u32, set: usize| {
         let seed = seed_of_set(config.seed, set);
-        let corner = |axis: u32| -1.0 + room * uniform01(seed, STREAM_R2_BOX, step, axis) + 0.5 * voxel;
-        R2Turn { corner: [0, 1, 2].map(|axis| corner(axis) as f32), image: data.sets.image_of_turn(set, seed, step) }
+        let corner = |axis: u32| -1.0 + room * uniform01(seed, STREAM_BOX, step, axis) + 0.5 * voxel;
+        PictureTurn {
+            corner: [0, 1, 2].map(|axis| corner(axis) as f32),
+            image: data.sets.image_of_turn(set, seed, step),
+        }
     };
     (0..=config.train.iterations).flat_map(|step| (0..data.n_sets()).map(move |set| turn(step, set))).collect()
 }

@@ -96,16 +96,18 @@ buffer_set! {
         gaussian_setup,
         /// [`R2Setup`].
         r2_setup,
+        /// [`crate::kernels::layout::PictureSetup`], of the stages that compare pictures.
+        picture_setup,
         /// [`crate::kernels::layout::GaussianView`] of each image.
         gaussian_views,
-        /// `[iteration][set]`: [`crate::kernels::layout::R2Turn`]s.
-        r2_turns,
+        /// `[iteration][set]`: [`crate::kernels::layout::PictureTurn`]s.
+        picture_turns,
         /// [`crate::kernels::layout::R2Schedule`]s.
         r2_schedule,
         /// Iterations done.
         gaussian_step,
         /// `[image][pixel]`: target line integrals.
-        r2_targets,
+        picture_targets,
         /// `[set][pixel]`: pictures in fixed point.
         splat_images,
         /// `[set][pixel]`: gradient of the loss.

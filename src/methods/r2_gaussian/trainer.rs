@@ -11,12 +11,12 @@ use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::dispatch::Binding;
-use crate::kernels::layout::{GaussianSetup, R2Gaussian, R2Setup};
+use crate::kernels::layout::{GaussianSetup, PictureSetup, R2Gaussian, R2Setup};
 use crate::methods::r2_gaussian::data::R2Data;
 use crate::methods::r2_gaussian::densify::{densified, densifies};
 use crate::methods::r2_gaussian::parameters::ScaleBounds;
 use crate::methods::r2_gaussian::particles::R2ParticleBuffers;
-use crate::methods::r2_gaussian::setup::{gaussian_setup, r2_setup, schedule, turns};
+use crate::methods::r2_gaussian::setup::{R2Setups, gaussian_setup, picture_setup, r2_setup, schedule, turns};
 use crate::methods::r2_gaussian::stages::{R2Buffers, R2Kernels, R2Parts, R2Pass, record_step};
 use crate::methods::r2_gaussian::start::first_rows;
 use crate::methods::r2_gaussian::state::{R2State, SMALLER_STEPS};
@@ -31,6 +31,7 @@ pub struct R2Trainer {
     config: Config,
     setup: GaussianSetup,
     r2: R2Setup,
+    pictures: PictureSetup,
     kernels: R2Kernels,
     buffers: R2Buffers,
     particles: R2ParticleBuffers,
@@ -69,13 +70,14 @@ impl R2Trainer {
         let n = check_count(state, &data)?;
         let (setup, r2) = (gaussian_setup(&data, config), r2_setup(&data, &config.r2));
         let kernels = R2Kernels::new(gpu, config.r2.integral)?;
-        let buffers = buffers(gpu, &data, config, (&setup, &r2), step)?;
+        let pictures = picture_setup(&data, &config.r2);
+        let buffers = buffers(gpu, &data, config, (&setup, &r2, &pictures), step)?;
         let particles = R2ParticleBuffers::new(gpu, state)?;
         let per_submit = config.train.iterations_per_submit;
         let parts = R2Parts { kernels: &kernels, buffers: &buffers, particles: &particles, setup: &setup, r2: &r2, n };
         let iterations = record(gpu, parts, per_submit)?;
         let (gpu, config) = (gpu.clone(), config.clone());
-        Ok(R2Trainer { gpu, data, config, setup, r2, kernels, buffers, particles, n, iterations, step })
+        Ok(R2Trainer { gpu, data, config, setup, r2, pictures, kernels, buffers, particles, n, iterations, step })
     }
 
     /// Data of the run.
@@ -84,8 +86,8 @@ impl R2Trainer {
     }
 
     /// Constants of the run.
-    pub fn setups(&self) -> (&GaussianSetup, &R2Setup) {
-        (&self.setup, &self.r2)
+    pub fn setups(&self) -> R2Setups<'_> {
+        (&self.setup, &self.r2, &self.pictures)
     }
 
     /// The Gaussians on the device, for tests.
@@ -210,7 +212,7 @@ fn buffers(
     gpu: &Gpu,
     data: &R2Data,
     config: &Config,
-    (setup, r2): (&GaussianSetup, &R2Setup),
+    (setup, r2, pictures): R2Setups<'_>,
     step: u32,
 ) -> Result<R2Buffers> {
     let views: Vec<_> = data.views.iter().map(|view| view.to_device()).collect();
@@ -223,11 +225,12 @@ fn buffers(
     Ok(R2Buffers {
         gaussian_setup: gpu.buffer_with("gaussian_setup", &[*setup])?,
         r2_setup: gpu.buffer_with("r2_setup", &[*r2])?,
+        picture_setup: gpu.buffer_with("picture_setup", &[*pictures])?,
         gaussian_views: gpu.buffer_with("gaussian_views", &views)?,
-        r2_turns: gpu.buffer_with("r2_turns", &turns(data, config))?,
+        picture_turns: gpu.buffer_with("picture_turns", &turns(data, config))?,
         r2_schedule: gpu.buffer_with("r2_schedule", &schedule(config))?,
         gaussian_step: gpu.buffer_with("gaussian_step", &[step])?,
-        r2_targets: gpu.buffer_with("r2_targets", &targets)?,
+        picture_targets: gpu.buffer_with("picture_targets", &targets)?,
         splat_images: new(Binding::splat_images, pixels)?,
         splat_image_gradient: new(Binding::splat_image_gradient, pixels)?,
         ssim_row_sums: new(Binding::ssim_row_sums, 4 * pixels)?,

@@ -2,9 +2,9 @@
 //! faint and huge ones are removed; and now and then all become faint. Each set is treated by itself.
 
 use crate::config::sections::X;
-use crate::kernels::layout::{XGaussian, XStatistics};
+use crate::kernels::layout::{BlendGaussian, XStatistics};
 use crate::methods::x_gaussian::state::XState;
-use crate::random::{STREAM_R2_CHILD, normal};
+use crate::random::{STREAM_CHILD, normal};
 use glam::DVec3;
 
 /// Factor by which the two halves of a split Gaussian are narrower.
@@ -45,7 +45,7 @@ pub fn densified(before: &XState, n_sets: usize, settings: &X, extent_mm: f64, (
         after.append(split_ones.iter().map(of).collect(), sets(&split_ones));
     }
     let large_ones_go = settings.reset_every > 0 && step > settings.reset_every;
-    let stays = |(g, statistics): (&XGaussian, &XStatistics)| {
+    let stays = |(g, statistics): (&BlendGaussian, &XStatistics)| {
         let too_wide = g.scales().max_element() > settings.max_scale * extent_mm;
         let too_large = settings.max_radius > 0.0 && f64::from(statistics.radius) > settings.max_radius;
         g.shown_opacity() >= settings.min_opacity && !(large_ones_go && (too_wide || too_large))
@@ -72,14 +72,14 @@ fn fates(state: &XState, n_sets: usize, settings: &X, extent_mm: f64) -> Vec<Fat
 }
 
 fn deviate(seed: u32, step: u32, row: usize, number: u32) -> f64 {
-    normal(seed.wrapping_add(step), STREAM_R2_CHILD, row as u32, number)
+    normal(seed.wrapping_add(step), STREAM_CHILD, row as u32, number)
 }
 
 /// A narrower Gaussian at a place drawn from the one that is split; `deviate` gives a standard normal number for each
 /// axis.
-fn split(g: &XGaussian, deviate: impl Fn(u32) -> f64) -> XGaussian {
+fn split(g: &BlendGaussian, deviate: impl Fn(u32) -> f64) -> BlendGaussian {
     let away = g.axes() * (g.scales() * DVec3::new(deviate(0), deviate(1), deviate(2)));
-    XGaussian {
+    BlendGaussian {
         position: (g.centre() + away).as_vec3().to_array(),
         log_scale: g.log_scale.map(|log| (f64::from(log) - NARROWER.ln()) as f32),
         ..*g
@@ -99,8 +99,8 @@ mod tests {
         Config::preset(Preset::XGaussian).x
     }
 
-    fn row(x: f32, scale_mm: f32, opacity: f64) -> XGaussian {
-        XGaussian {
+    fn row(x: f32, scale_mm: f32, opacity: f64) -> BlendGaussian {
+        BlendGaussian {
             position: [x, -2.0, 3.0],
             opacity: stored_opacity(opacity.ln()) as f32,
             log_scale: [scale_mm.ln(); 3],
@@ -145,7 +145,7 @@ mod tests {
 
     #[test]
     fn faint_and_huge_ones_go_and_a_full_set_takes_no_more() {
-        let state = |rows: Vec<XGaussian>| {
+        let state = |rows: Vec<BlendGaussian>| {
             let n = rows.len();
             let mut state = XState::fresh(rows, vec![0; n]);
             state.statistics.iter_mut().for_each(|s| s.radius = 30.0);

@@ -63,7 +63,7 @@ fn entries(gpu: &Gpu, capacity: u32) -> Result<Buffer> {
 pub fn download(gpu: &Gpu, seen: &BlendedGaussians, learning: &XLearningBuffers, sets: &[u32]) -> Result<XState> {
     let n = sets.len();
     Ok(XState {
-        rows: gpu.download(&seen.x_gaussians, 0, n)?,
+        rows: gpu.download(&seen.blend_gaussians, 0, n)?,
         sets: sets.to_vec(),
         first: gpu.download(&learning.gaussian_adam_first, 0, n)?,
         second: gpu.download(&learning.gaussian_adam_second, 0, n)?,

@@ -6,7 +6,7 @@ use crate::fitting::RING_LENGTH;
 use crate::fitting::sets::seed_of_set;
 use crate::gaussians::blending::{FIXED_POINT_BITS, NEAREST_MM, TILE};
 use crate::gaussians::comparison::picture_parts;
-use crate::kernels::layout::{GaussianSetup, R2Setup, R2Turn, XSchedule, XSetup};
+use crate::kernels::layout::{BlendSetup, GaussianSetup, PictureSetup, PictureTurn, XSchedule};
 use crate::methods::x_gaussian::data::XData;
 use crate::methods::x_gaussian::densify::{densifies, resets};
 
@@ -45,17 +45,13 @@ pub fn gaussian_setup(data: &XData, config: &Config) -> GaussianSetup {
 }
 
 /// Constants of the stages that compare pictures, which weigh SSIM beside an absolute difference of weight 1.
-pub fn comparing_setup(data: &XData, settings: &X) -> R2Setup {
-    R2Setup {
-        n_sets: data.n_sets() as u32,
-        ssim_weight: (settings.ssim / absolute_weight(settings)) as f32,
-        ..R2Setup::default()
-    }
+pub fn comparing_setup(data: &XData, settings: &X) -> PictureSetup {
+    PictureSetup { n_sets: data.n_sets() as u32, ssim_weight: (settings.ssim / absolute_weight(settings)) as f32 }
 }
 
 /// Constants of this method, of pictures of `size` (columns, rows) and lists with room for `capacity`.
-pub fn x_setup(settings: &X, n_sets: u32, [columns, rows]: [u32; 2], capacity: u32) -> XSetup {
-    XSetup {
+pub fn blend_setup(settings: &X, n_sets: u32, [columns, rows]: [u32; 2], capacity: u32) -> BlendSetup {
+    BlendSetup {
         nearest: NEAREST_MM as f32,
         n_sets,
         tile_columns: columns.div_ceil(TILE),
@@ -96,10 +92,10 @@ pub fn schedule(config: &Config, extent_mm: f64) -> Vec<XSchedule> {
 }
 
 /// Turns of each set in each iteration of the schedule: an image, in an order that is drawn anew when all have been seen.
-pub fn turns(data: &XData, config: &Config) -> Vec<R2Turn> {
-    let turn = |step: u32, set: usize| R2Turn {
+pub fn turns(data: &XData, config: &Config) -> Vec<PictureTurn> {
+    let turn = |step: u32, set: usize| PictureTurn {
         image: data.sets.image_of_turn(set, seed_of_set(config.seed, set), step),
-        ..R2Turn::default()
+        ..PictureTurn::default()
     };
     (0..=config.train.iterations).flat_map(|step| (0..data.n_sets()).map(move |set| turn(step, set))).collect()
 }

@@ -1,6 +1,6 @@
 //! The stages of a fit as X-Gaussian does it, what they bind, and one iteration of all sets, top to bottom:
 //!
-//! x_project -> (x_sort_count -> x_sort_scan -> x_sort_move) of each four bits -> x_lists -> x_blend -> ssim_rows ->
+//! blend_project -> (blend_sort_count -> blend_sort_scan -> blend_sort_move) of each four bits -> blend_lists -> blend_picture -> ssim_rows ->
 //! ssim_columns -> ssim_rows_back -> picture_residual -> x_blend_back -> x_update -> x_report
 
 use crate::error::Result;
@@ -10,7 +10,7 @@ use crate::gaussians::comparison::{ComparisonKernels, RecordStage};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
 use crate::kernels::dispatch::{BufferSet, buffer_set, dispatch_finding};
-use crate::kernels::layout::{GaussianSetup, XSetup};
+use crate::kernels::layout::{BlendSetup, GaussianSetup};
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
 use crate::methods::x_gaussian::particles::XLearningBuffers;
@@ -50,12 +50,12 @@ impl XKernels {
 buffer_set! {
     /// Buffers of a fit, except for pictures and Gaussians.
     pub struct XFitBuffers {
-        /// [`crate::kernels::layout::R2Setup`], of the stages that compare pictures.
-        r2_setup,
+        /// [`crate::kernels::layout::PictureSetup`], of the stages that compare pictures.
+        picture_setup,
         /// [`crate::kernels::layout::XSchedule`]s.
         x_schedule,
         /// `[image][pixel]`: target images.
-        r2_targets,
+        picture_targets,
         /// `[set][pixel]`: gradient of the loss.
         splat_image_gradient,
         /// `[set][pixel]`: SSIM's sums along rows.
@@ -91,7 +91,7 @@ pub struct XParts<'a> {
     /// Constants on the host.
     pub setup: &'a GaussianSetup,
     /// Constants of this method on the host.
-    pub x: &'a XSetup,
+    pub x: &'a BlendSetup,
     /// Number of Gaussians of all sets.
     pub n: u32,
 }

@@ -4,7 +4,7 @@ use crate::config::sections::X;
 use crate::gaussians::blending::opacity::stored_opacity;
 use crate::gaussians::field::rotation_none;
 use crate::gaussians::spacing::spacings;
-use crate::kernels::layout::XGaussian;
+use crate::kernels::layout::BlendGaussian;
 use crate::methods::x_gaussian::data::XData;
 use crate::methods::x_gaussian::state::XState;
 use glam::DVec3;
@@ -27,14 +27,14 @@ fn voxel_centres(settings: &X) -> Vec<DVec3> {
 pub fn first_state(data: &XData, settings: &X) -> XState {
     let centres = voxel_centres(settings);
     let opacity = stored_opacity(settings.first_opacity.ln()) as f32;
-    let row = |(x, spacing): (&DVec3, f64)| XGaussian {
+    let row = |(x, spacing): (&DVec3, f64)| BlendGaussian {
         position: (*x * data.half_mm).as_vec3().to_array(),
         opacity,
         log_scale: [(spacing * data.half_mm).ln() as f32; 3],
         intensity: FIRST_INTENSITY,
         rotation: rotation_none(),
     };
-    let rows: Vec<XGaussian> = centres.iter().zip(spacings(&centres)).map(row).collect();
+    let rows: Vec<BlendGaussian> = centres.iter().zip(spacings(&centres)).map(row).collect();
     let n_sets = data.n_sets();
     let sets = (0..n_sets as u32).flat_map(|set| std::iter::repeat_n(set, rows.len())).collect();
     XState::fresh(rows.repeat(n_sets), sets)

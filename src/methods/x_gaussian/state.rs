@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::gaussians::blending::opacity::stored_opacity;
-use crate::kernels::layout::{XGaussian, XStatistics};
+use crate::kernels::layout::{BlendGaussian, XStatistics};
 
 /// Settings that make the steps of a fit smaller.
 pub const SMALLER_STEPS: &str = "lower learning rates in section `x`: x.position_lr_init, x.feature_lr, \
@@ -13,7 +13,7 @@ pub const SMALLER_STEPS: &str = "lower learning rates in section `x`: x.position
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct XState {
     /// Parameters.
-    pub rows: Vec<XGaussian>,
+    pub rows: Vec<BlendGaussian>,
     /// Set of each Gaussian.
     pub sets: Vec<u32>,
     /// First moments of Adam: position and opacity, scale and intensity, rotation.
@@ -34,7 +34,7 @@ fn retain_marked<T>(values: &mut Vec<T>, keep: &[bool]) {
 
 impl XState {
     /// Returns Gaussians with zero moments and statistics, and the set of each.
-    pub fn fresh(rows: Vec<XGaussian>, sets: Vec<u32>) -> XState {
+    pub fn fresh(rows: Vec<BlendGaussian>, sets: Vec<u32>) -> XState {
         let n = rows.len();
         let statistics = vec![XStatistics::default(); n];
         XState { rows, sets, first: vec![[0.0; 12]; n], second: vec![[0.0; 12]; n], statistics }
@@ -50,7 +50,7 @@ impl XState {
     }
 
     /// Appends Gaussians with zero moments and statistics, and the set of each.
-    pub fn append(&mut self, rows: Vec<XGaussian>, sets: Vec<u32>) {
+    pub fn append(&mut self, rows: Vec<BlendGaussian>, sets: Vec<u32>) {
         let fresh = XState::fresh(rows, sets);
         self.rows.extend(fresh.rows);
         self.sets.extend(fresh.sets);
@@ -78,8 +78,9 @@ impl XState {
     /// # Errors
     /// [`Error::Diverged`] with the first such parameter.
     pub fn check(&self, step: u32) -> Result<()> {
-        let numbers =
-            |g: &XGaussian| g.position.into_iter().chain(g.log_scale).chain(g.rotation).chain([g.opacity, g.intensity]);
+        let numbers = |g: &BlendGaussian| {
+            g.position.into_iter().chain(g.log_scale).chain(g.rotation).chain([g.opacity, g.intensity])
+        };
         match self.rows.iter().flat_map(numbers).find(|v| !v.is_finite()) {
             Some(bad) => {
                 let quantity = "a parameter of a Gaussian";
@@ -97,7 +98,7 @@ mod tests {
     #[test]
     fn opacities_come_back_from_what_is_stored() {
         for opacity in [1e-6f64, 0.005, 0.1, 0.5, 0.99] {
-            let g = XGaussian { opacity: stored_opacity(opacity.ln()) as f32, ..XGaussian::default() };
+            let g = BlendGaussian { opacity: stored_opacity(opacity.ln()) as f32, ..BlendGaussian::default() };
             assert!((g.shown_opacity() / opacity - 1.0).abs() < 1e-5, "{opacity}");
             assert!((g.log_opacity() - opacity.ln()).abs() < 1e-5, "{opacity}");
         }
@@ -107,7 +108,7 @@ mod tests {
 
     #[test]
     fn reset_opacities_are_forgotten() {
-        let row = |opacity: f32| XGaussian { opacity, ..XGaussian::default() };
+        let row = |opacity: f32| BlendGaussian { opacity, ..BlendGaussian::default() };
         let mut state = XState::fresh(vec![row(2.0), row(-7.0)], vec![0, 0]);
         state.first[0] = [1.0; 12];
         state.reset_opacities(0.01);

@@ -1,7 +1,7 @@
 //! State of a fit of X-Gaussian in a checkpoint: tensors under documented names.
 
 use crate::error::{Error, Result};
-use crate::kernels::layout::{XGaussian, XStatistics};
+use crate::kernels::layout::{BlendGaussian, XStatistics};
 use crate::methods::x_gaussian::state::XState;
 use crate::tensors::{File, FileTensor};
 use safetensors::tensor::Dtype;
@@ -15,7 +15,7 @@ pub(super) fn tensors(state: &XState) -> Vec<FileTensor> {
         let shape = if width == 1 { vec![n] } else { vec![n, width] };
         (format!("x.{name}"), Dtype::F32, shape, values.into_iter().flat_map(f32::to_le_bytes).collect())
     };
-    let of_rows = |of: &dyn Fn(&XGaussian) -> Vec<f32>| state.rows.iter().flat_map(of).collect();
+    let of_rows = |of: &dyn Fn(&BlendGaussian) -> Vec<f32>| state.rows.iter().flat_map(of).collect();
     let moments = |all: &[[f32; N_NUMBERS]]| all.iter().flatten().copied().collect();
     let sets = state.sets.iter().flat_map(|set| set.to_le_bytes()).collect();
     let statistics = state.statistics.iter().flat_map(|s| [s.pull, s.seen, s.radius]).collect();
@@ -44,7 +44,7 @@ pub(super) fn read(file: &File<'_>, n_phases: usize) -> Result<XState> {
     if let Some(bad) = sets.iter().find(|set| **set as usize >= n_phases) {
         return Err(Error::data(file.path, "x.set", format!("has set {bad}, but sets go from 0 to below {n_phases}")));
     }
-    let row = |i: usize| XGaussian {
+    let row = |i: usize| BlendGaussian {
         position: [0, 1, 2].map(|k| position[3 * i + k]),
         opacity: opacity[i],
         log_scale: [0, 1, 2].map(|k| scale[3 * i + k]),

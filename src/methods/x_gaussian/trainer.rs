@@ -14,11 +14,13 @@ use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::dispatch::Binding;
-use crate::kernels::layout::{GaussianSetup, R2Setup, XCounts, XEnd, XGaussian, XList, XSetup, XStatus};
+use crate::kernels::layout::{
+    BlendCounts, BlendEnd, BlendGaussian, BlendList, BlendSetup, GaussianSetup, PictureSetup, XStatus,
+};
 use crate::methods::x_gaussian::data::XData;
 use crate::methods::x_gaussian::densify::{densified, densifies, resets};
 use crate::methods::x_gaussian::particles::{SUMS, XLearningBuffers, download};
-use crate::methods::x_gaussian::setup::{comparing_setup, gaussian_setup, schedule, turns, x_setup};
+use crate::methods::x_gaussian::setup::{blend_setup, comparing_setup, gaussian_setup, schedule, turns};
 use crate::methods::x_gaussian::stages::{XFitBuffers, XKernels, XParts};
 use crate::methods::x_gaussian::start::first_state;
 use crate::methods::x_gaussian::state::{SMALLER_STEPS, XState};
@@ -41,7 +43,7 @@ pub struct XTrainer {
     data: XData,
     config: Config,
     setup: GaussianSetup,
-    x: XSetup,
+    x: BlendSetup,
     kernels: XKernels,
     scene: BlendBuffers,
     fit: XFitBuffers,
@@ -82,7 +84,7 @@ impl XTrainer {
         let n = check_count(state, &data, config.x.min_opacity)?;
         let setup = gaussian_setup(&data, &config);
         let capacity = first_capacity(n, capacity_limit(gpu));
-        let x = x_setup(&config.x, data.n_sets() as u32, [setup.width, setup.height], capacity);
+        let x = blend_setup(&config.x, data.n_sets() as u32, [setup.width, setup.height], capacity);
         let kernels = XKernels::new(gpu)?;
         let scene = scene_buffers(gpu, &data, &config, (&setup, &x), step)?;
         let fit = fit_buffers(gpu, &data, &config, &setup)?;
@@ -99,12 +101,12 @@ impl XTrainer {
     }
 
     /// Constants of the run.
-    pub fn setups(&self) -> (&GaussianSetup, &XSetup) {
+    pub fn setups(&self) -> (&GaussianSetup, &BlendSetup) {
         (&self.setup, &self.x)
     }
 
     /// Constants of the stages that compare pictures.
-    pub fn comparing_setup(&self) -> R2Setup {
+    pub fn comparing_setup(&self) -> PictureSetup {
         comparing_setup(&self.data, &self.config.x)
     }
 
@@ -137,7 +139,7 @@ impl XTrainer {
     /// Device errors.
     pub fn set_capacity(&mut self, capacity: u32) -> Result<()> {
         self.x.capacity = capacity;
-        self.gpu.upload(&self.scene.x_setup, 0, &[self.x])?;
+        self.gpu.upload(&self.scene.blend_setup, 0, &[self.x])?;
         self.seen.make_room(&self.gpu, capacity)?;
         self.learning.make_room(&self.gpu, capacity)?;
         self.iterations = None;
@@ -155,6 +157,7 @@ impl XTrainer {
                 status[0].entries,
                 capacity_limit(&self.gpu),
                 ("x.max_gaussians", self.config.x.max_gaussians.into()),
+                "smaller pictures, a larger x.interval, or x.static_data = \"pooled\"",
             )?)?;
         }
         Ok(had_room)
@@ -284,7 +287,7 @@ impl SetsFit for XTrainer {
 
 /// Maximum number of Gaussians of a set, such that all sets fit the device's buffers.
 fn max_of_set(gpu: &Gpu, data: &XData) -> u32 {
-    gpu.info().max_storage_buffer_range / size_of::<XGaussian>() as u32 / data.n_sets() as u32
+    gpu.info().max_storage_buffer_range / size_of::<BlendGaussian>() as u32 / data.n_sets() as u32
 }
 
 /// Maximum number of list entries whose gradients a buffer holds.
@@ -312,7 +315,7 @@ fn scene_buffers(
     gpu: &Gpu,
     data: &XData,
     config: &Config,
-    (setup, x): (&GaussianSetup, &XSetup),
+    (setup, x): (&GaussianSetup, &BlendSetup),
     step: u32,
 ) -> Result<BlendBuffers> {
     let views: Vec<_> = data.views.iter().map(|view| view.to_device()).collect();
@@ -321,15 +324,15 @@ fn scene_buffers(
     let pixels = u64::from(setup.image_stride) * u64::from(x.n_sets);
     Ok(BlendBuffers {
         gaussian_setup: gpu.buffer_with("gaussian_setup", &[*setup])?,
-        x_setup: gpu.buffer_with("x_setup", &[*x])?,
+        blend_setup: gpu.buffer_with("blend_setup", &[*x])?,
         gaussian_views: gpu.buffer_with("gaussian_views", &views)?,
-        r2_turns: gpu.buffer_with("r2_turns", &turns(data, config))?,
+        picture_turns: gpu.buffer_with("picture_turns", &turns(data, config))?,
         gaussian_step: gpu.buffer_with("gaussian_step", &[step])?,
-        x_tile_counts: new(Binding::x_tile_counts, 4 * n_tiles)?,
-        x_counts: new(Binding::x_counts, size_of::<XCounts>() as u64)?,
-        x_lists: new(Binding::x_lists, size_of::<XList>() as u64 * n_tiles)?,
+        blend_tile_counts: new(Binding::blend_tile_counts, 4 * n_tiles)?,
+        blend_counts: new(Binding::blend_counts, size_of::<BlendCounts>() as u64)?,
+        blend_lists: new(Binding::blend_lists, size_of::<BlendList>() as u64 * n_tiles)?,
         splat_images: new(Binding::splat_images, 4 * pixels)?,
-        x_ends: new(Binding::x_ends, size_of::<XEnd>() as u64 * pixels)?,
+        blend_ends: new(Binding::blend_ends, size_of::<BlendEnd>() as u64 * pixels)?,
     })
 }
 
@@ -340,9 +343,9 @@ fn fit_buffers(gpu: &Gpu, data: &XData, config: &Config, setup: &GaussianSetup) 
     let new = |name: Binding, n: u64| gpu.buffer(name.name(), 4 * n, Memory::Device);
     let pixels = u64::from(setup.image_stride) * data.n_sets() as u64;
     Ok(XFitBuffers {
-        r2_setup: gpu.buffer_with("r2_setup", &[comparing_setup(data, &config.x)])?,
+        picture_setup: gpu.buffer_with("picture_setup", &[comparing_setup(data, &config.x)])?,
         x_schedule: gpu.buffer_with("x_schedule", &schedule(config, data.extent_mm))?,
-        r2_targets: gpu.buffer_with("r2_targets", &targets)?,
+        picture_targets: gpu.buffer_with("picture_targets", &targets)?,
         splat_image_gradient: new(Binding::splat_image_gradient, pixels)?,
         ssim_row_sums: new(Binding::ssim_row_sums, 4 * pixels)?,
         ssim_row_products: new(Binding::ssim_row_products, pixels)?,

@@ -1,7 +1,7 @@
 //! f64 reference implementation (twin) of `gaussian_rays` and `gaussian_points`: plain sums over all Gaussians, and small
 //! steps along rays.
 
-use crate::gaussians::field::{DynamicGaussians, Units};
+use crate::gaussians::field::{GaussianField, Units};
 use crate::kernels::layout::{Gaussian, GaussianSetup};
 use glam::{DMat3, DQuat, DVec3};
 
@@ -43,7 +43,7 @@ fn gauss(g: &Gaussian, units: Units, setup: &GaussianSetup) -> Gauss {
 }
 
 /// Returns the Gaussians of the field at a phase.
-pub fn field(field: &DynamicGaussians, phase: usize) -> Vec<Gauss> {
+pub fn field(field: &GaussianField, phase: usize) -> Vec<Gauss> {
     let sets = field.rows();
     field.at(phase).iter().map(|g| gauss(g, sets.units, &sets.setup)).collect()
 }

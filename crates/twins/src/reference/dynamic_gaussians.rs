@@ -3,7 +3,7 @@
 
 use crate::gaussians::field::{basis, shares};
 use crate::gaussians::view::SplatView;
-use crate::kernels::layout::{DeformableSetup, GaussianSetup};
+use crate::kernels::layout::{GaussianSetup, MotionGridSetup};
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::reference::gaussians::{self, N_PARAMS, Params};
 use crate::scan::gating::BeatTime;
@@ -43,7 +43,7 @@ struct Motion {
     basis: Vec<f64>,
 }
 
-fn motion(deformable: &DeformableSetup, rest: &Params, phase: usize, n_phases: usize) -> Motion {
+fn motion(deformable: &MotionGridSetup, rest: &Params, phase: usize, n_phases: usize) -> Motion {
     let nodes = shares(deformable, DVec3::new(rest[0], rest[1], rest[2]))
         .map(|(n, share)| (phase * deformable.nodes() + n, share));
     let since_rest = (phase as f64 - f64::from(deformable.rest_phase)) / n_phases as f64;
@@ -74,7 +74,7 @@ fn filling_shown(p: &DeformableParams, i: usize, phase: usize, view: &SplatView,
 
 /// Returns a Gaussian as in an image of a phase: linearly interpolated between two phases.
 pub fn shown(
-    deformable: &DeformableSetup,
+    deformable: &MotionGridSetup,
     p: &DeformableParams,
     i: usize,
     phase: usize,
@@ -94,7 +94,7 @@ pub fn shown(
 pub fn loss_and_gradient(
     targets: &Targets,
     setup: &GaussianSetup,
-    deformable: &DeformableSetup,
+    deformable: &MotionGridSetup,
     p: &DeformableParams,
 ) -> (f64, f64, DeformableParams) {
     let n = targets.n_pixels();
@@ -153,7 +153,7 @@ fn add_place(gradient: &mut DeformableParams, i: usize, at_rest: bool, motion: &
 /// Adds the gradient of the penalties, and returns their value: squared own motion, and squared differences of neighbouring
 /// nodes.
 fn add_penalties(
-    deformable: &DeformableSetup,
+    deformable: &MotionGridSetup,
     p: &DeformableParams,
     n_phases: usize,
     gradient: &mut DeformableParams,

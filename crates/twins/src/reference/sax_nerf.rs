@@ -3,7 +3,7 @@
 use crate::kernels::layout::{SaxLevel, SaxSetup};
 use crate::methods::sax_nerf::data::SaxData;
 use crate::methods::sax_nerf::field::{FEATURES, SaxShape, WIDTH};
-use crate::random::{STREAM_DEPTH, STREAM_RAY, STREAM_SAX_WINDOW, permute, uniform01};
+use crate::random::{STREAM_DEPTH, STREAM_RAY, STREAM_WINDOW, permute, uniform01};
 use std::collections::HashSet;
 use std::ops::Range;
 
@@ -31,7 +31,7 @@ pub fn batch(data: &SaxData, setup: &SaxSetup, set: usize, seed: u32, step: u32)
     let n_tiles = (columns * (data.height / side)) as u32;
     let mut rays = Vec::new();
     for k in 0..setup.n_windows {
-        let tile = permute(k, n_tiles, seed, step, STREAM_SAX_WINDOW) as usize;
+        let tile = permute(k, n_tiles, seed, step, STREAM_WINDOW) as usize;
         let (column, row) = (tile % columns * side, tile / columns * side);
         rays.extend((0..side * side).map(|at| (row + at / side) * data.width + column + at % side));
     }

@@ -1,7 +1,7 @@
 //! f64 reference implementations (twins) of the stages of X-Gaussian, as plain loops without the device.
 
 use crate::gaussians::view::SplatView;
-use crate::kernels::layout::{GaussianSetup, Splat, XGaussian, XSchedule, XSetup};
+use crate::kernels::layout::{BlendGaussian, BlendSetup, GaussianSetup, Splat, XSchedule};
 use crate::reference::adam::Adam;
 use crate::reference::gaussians;
 use glam::{DMat2, DMat3, DVec2, DVec3};
@@ -27,7 +27,7 @@ const MIN_ALPHA: f64 = 1.0 / 255.0;
 const MIN_LIGHT: f64 = 1e-4;
 
 /// Returns the stored parameters of a Gaussian.
-pub fn params(g: &XGaussian) -> Params {
+pub fn params(g: &BlendGaussian) -> Params {
     let mut out = [0.0; N_PARAMS];
     let all = g.position.iter().chain([&g.opacity]).chain(&g.log_scale).chain([&g.intensity]).chain(&g.rotation);
     out.iter_mut().zip(all).for_each(|(p, v)| *p = f64::from(*v));
@@ -96,7 +96,7 @@ pub struct Projection {
 }
 
 /// Projects a Gaussian into a view; `None` at the source and behind it.
-pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup, x: &XSetup) -> Option<Projection> {
+pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup, x: &BlendSetup) -> Option<Projection> {
     let (depth, column, row) = view.project(DVec3::new(p[0], p[1], p[2]));
     if depth <= f64::from(x.nearest) {
         return None;
@@ -126,7 +126,7 @@ pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup, x: &XSetup) 
 }
 
 /// First tile (column, row) of a splat's square, and one after the last.
-pub fn tiles_of(mean: DVec2, radius: f64, x: &XSetup) -> [u32; 4] {
+pub fn tiles_of(mean: DVec2, radius: f64, x: &BlendSetup) -> [u32; 4] {
     let along = |v: f64, n: u32| (v / TILE as f64).trunc().clamp(0.0, n.into()) as u32;
     let last = TILE as f64 - 1.0;
     let all = [
@@ -139,7 +139,7 @@ pub fn tiles_of(mean: DVec2, radius: f64, x: &XSetup) -> [u32; 4] {
 }
 
 /// Pixels of a tile inside the image: index in the image, column and row.
-fn pixels_of(tile: usize, setup: &GaussianSetup, x: &XSetup) -> Vec<(usize, DVec2)> {
+fn pixels_of(tile: usize, setup: &GaussianSetup, x: &BlendSetup) -> Vec<(usize, DVec2)> {
     let (width, height) = (setup.width as usize, setup.height as usize);
     let corner = [tile % x.tile_columns as usize * TILE, tile / x.tile_columns as usize * TILE];
     let rows = corner[1]..(corner[1] + TILE).min(height);
@@ -164,7 +164,7 @@ fn shown(list: &[Blot], at: DVec2) -> (f64, f64, usize) {
 }
 
 /// Blends an image from lists of Gaussians, one per tile, and returns the transmittance of each pixel as well.
-pub fn blend(lists: &[Vec<Blot>], setup: &GaussianSetup, x: &XSetup) -> (Vec<f64>, Vec<f64>) {
+pub fn blend(lists: &[Vec<Blot>], setup: &GaussianSetup, x: &BlendSetup) -> (Vec<f64>, Vec<f64>) {
     let n = (setup.width * setup.height) as usize;
     let (mut picture, mut left) = (vec![0.0; n], vec![1.0; n]);
     for (tile, list) in lists.iter().enumerate() {
@@ -177,7 +177,7 @@ pub fn blend(lists: &[Vec<Blot>], setup: &GaussianSetup, x: &XSetup) -> (Vec<f64
 
 /// Sums of each Gaussian of a tile's list over the tile's pixels, with gradients given for the whole image. They are
 /// computed front to back: the contribution behind a Gaussian is the pixel's value minus that of the Gaussians up to it.
-pub fn blend_back(tile: usize, list: &[Blot], setup: &GaussianSetup, x: &XSetup, gradient: &[f64]) -> Vec<Sums> {
+pub fn blend_back(tile: usize, list: &[Blot], setup: &GaussianSetup, x: &BlendSetup, gradient: &[f64]) -> Vec<Sums> {
     let mut sums = vec![[0.0; 7]; list.len()];
     for (pixel, at) in pixels_of(tile, setup, x) {
         let g = f64::from(x.absolute_weight) * gradient[pixel];
@@ -236,7 +236,7 @@ pub fn gradient(p: &Params, seen: &Projection, view: &SplatView, sums: &Sums) ->
 }
 
 /// Lists of Gaussians of one image, one per tile, as indices, nearest first.
-pub fn tile_lists(seen: &[Option<Projection>], x: &XSetup) -> Vec<Vec<usize>> {
+pub fn tile_lists(seen: &[Option<Projection>], x: &BlendSetup) -> Vec<Vec<usize>> {
     let mut order: Vec<(usize, &Projection)> =
         seen.iter().enumerate().filter_map(|(i, seen)| Some((i, seen.as_ref()?))).collect();
     order.sort_by(|a, b| a.1.depth.total_cmp(&b.1.depth));

@@ -2,7 +2,7 @@
 
 use crate::config::{Config, Preset};
 use crate::error::{Error, Result};
-use crate::gaussians::field::DynamicGaussians;
+use crate::gaussians::field::GaussianField;
 use crate::gpu::device::Gpu;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::Tuning;
@@ -17,8 +17,7 @@ use crate::render::renderer::Renderer;
 use crate::scan::dataset::Dataset;
 use crate::scan::small::small_dataset;
 use crate::selftest::compare::{Findings, Tolerance};
-use crate::selftest::problems::{drawn_fields, random_gaussians};
-use crate::selftest::r2_gaussian as r2;
+use crate::selftest::problems::{FAST_NETWORK, drawn_fields, random_gaussians};
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 
@@ -46,11 +45,11 @@ const CELL_STRIDE: usize = 17;
 ///
 /// # Errors
 /// Device errors.
-pub fn model(gpu: &Gpu, dataset: &Dataset, field: DynamicGaussians, tuning: &Tuning) -> Result<Model> {
-    let config = Config::load(Some(Preset::FastMlp), None, &["hull.enabled=false".into()])?;
+pub fn model(gpu: &Gpu, dataset: &Dataset, field: GaussianField, tuning: &Tuning) -> Result<Model> {
+    let config = Config::load(Some(FAST_NETWORK), None, &["hull.enabled=false".into()])?;
     let mut trainer = Trainer::new(gpu, Plan::new(&config, dataset)?, dataset, tuning.clone())?;
     let of_network = trainer.model()?;
-    let config = Config::preset(Preset::Fast);
+    let config = Config::preset(Preset::default());
     let param_map = ParamMap::new(&config, dataset.n_phases as usize);
     Ok(Model {
         params: param_map.initial(&config),
@@ -62,8 +61,8 @@ pub fn model(gpu: &Gpu, dataset: &Dataset, field: DynamicGaussians, tuning: &Tun
     })
 }
 
-fn form(field: &DynamicGaussians) -> &'static str {
-    if field.deformable().is_some() { "deformable" } else { "phase" }
+fn form(field: &GaussianField) -> &'static str {
+    if field.moving().is_some() { "deformable" } else { "phase" }
 }
 
 /// Compares integrals and maximum values along rays, and pictures.
@@ -105,16 +104,15 @@ pub fn compare_rays(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Resu
     Ok(())
 }
 
-/// Compares the maximum values along rays where more Gaussians overlap than peaks are kept of.
+/// Compares the maximum values along rays where more Gaussians overlap than peaks are kept of; `config` is that of many Gaussians.
 ///
 /// # Errors
 /// Device errors.
-pub fn compare_maxima(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
+pub fn compare_maxima(gpu: &Gpu, config: &Config, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
     findings.begin("r2", "600 Gaussians that overlap, view of 37 x 29 pixels");
     let (width, height) = (37, 29);
     let dataset = small_dataset(width, height, 3)?;
-    let config = r2::small_config(&[])?;
-    let mut trainer = Trainer::new(gpu, Plan::new(&config, &dataset)?, &dataset, tuning.clone())?;
+    let mut trainer = Trainer::new(gpu, Plan::new(config, &dataset)?, &dataset, tuning.clone())?;
     let mut model = trainer.model()?;
     let overlapping = overlapping(&model)?;
     model.gaussians = Some(overlapping.clone());
@@ -135,9 +133,9 @@ const SEARCH_MARGIN: f64 = 4.0;
 /// the depths that the kernel looks at.
 const WIDTHS: [f64; 2] = [0.004, 0.1];
 
-/// Gaussians of phase 0, narrow and wide ones, in a model of R2-Gaussian.
-fn overlapping(model: &Model) -> Result<DynamicGaussians> {
-    let Some(DynamicGaussians::PerPhase(mut field)) = model.gaussians.clone() else {
+/// Gaussians of phase 0, narrow and wide ones, in a model of many Gaussians.
+fn overlapping(model: &Model) -> Result<GaussianField> {
+    let Some(GaussianField::PerPhase(mut field)) = model.gaussians.clone() else {
         return Err(Error::Internal("the model has no Gaussians".into()));
     };
     let pixels = model.scene.static_max[0] / field.units.pixel;
@@ -149,7 +147,7 @@ fn overlapping(model: &Model) -> Result<DynamicGaussians> {
         g.log_scale = g.log_scale.map(|log| log + width as f32);
     }
     field.rows = rows;
-    Ok(DynamicGaussians::PerPhase(field))
+    Ok(GaussianField::PerPhase(field))
 }
 
 /// Compares cells of volumes.

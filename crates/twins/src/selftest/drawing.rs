@@ -23,7 +23,7 @@ use crate::scan::gating::BeatTime;
 use crate::scan::small::small_dataset;
 use crate::selftest::compare::{Findings, Tolerance};
 use crate::selftest::iteration::{STEADY, path_name, sine_factor};
-use crate::selftest::problems::small_config;
+use crate::selftest::problems::{FAST_NETWORK, TWO_NETWORKS, small_config};
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 use std::sync::Arc;
@@ -86,7 +86,7 @@ const ITERATIONS: u32 = 5;
 /// Device errors.
 pub fn compare_views(gpu: &Gpu, preset: Preset, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
     findings.begin(path_name(tuning.layers), &format!("{}, view of 12 x 10 pixels", preset.name()));
-    let two_networks = preset == Preset::NerfCa;
+    let two_networks = preset == TWO_NETWORKS;
     let scaled = if two_networks { "networks.gain=0.5" } else { "loss.normalise=true" };
     let settings = [scaled, "train.chunk_samples=1500"];
     let trained = Trained::new(gpu, small_dataset(12, 10, 3)?, preset, &settings, tuning)?;
@@ -124,11 +124,11 @@ pub fn compare_views(gpu: &Gpu, preset: Preset, tuning: &Tuning, findings: &mut 
 pub fn compare_volumes(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
     findings.begin(path_name(tuning.layers), "43 x 9 x 11 cells");
     let settings = ["train.rays=64", "train.chunk_samples=2000", "march.render_samples=200"];
-    let trained = Trained::new(gpu, small_dataset(24, 20, 3)?, Preset::FastMlp, &settings, tuning)?;
+    let trained = Trained::new(gpu, small_dataset(24, 20, 3)?, FAST_NETWORK, &settings, tuning)?;
     let renderer = Arc::new(Renderer::new(gpu, &trained.model, tuning.clone())?);
     compare_cells(&trained, &renderer, sine_factor(gpu.info()), findings)?;
     findings.begin(path_name(tuning.layers), "43 x 9 x 11 cells of two networks");
-    let two = Trained::new(gpu, small_dataset(24, 20, 3)?, Preset::NerfCa, &settings, tuning)?;
+    let two = Trained::new(gpu, small_dataset(24, 20, 3)?, TWO_NETWORKS, &settings, tuning)?;
     let of_two = Renderer::new(gpu, &two.model, tuning.clone())?;
     compare_cells(&two, &of_two, sine_factor(gpu.info()), findings)?;
     findings.begin(path_name(tuning.layers), "baked view of 24 x 20 pixels");

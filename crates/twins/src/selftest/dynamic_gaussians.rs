@@ -1,16 +1,18 @@
 //! One set of Gaussians that moves over the beat: an iteration of its fit, stage by stage.
 
+use crate::config::{Config, Preset, sections};
 use crate::error::{Error, Result};
 use crate::gaussians::particles::Particles;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
 use crate::kernels::dispatch::{BufferSet, dispatch_finding};
-use crate::kernels::layout::{DeformableSetup, GaussianSetup};
+use crate::kernels::layout::{Gaussian, GaussianSetup, MotionGridSetup};
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use crate::methods::dynamic_gaussians::filling::{FILLING_RATE, MIN_FILLING};
+use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::reference::dynamic_gaussians::{DeformableParams, loss_and_gradient, phases_shown, shown};
 use crate::reference::gaussians::{self as reference, N_PARAMS, Params};
@@ -18,7 +20,8 @@ use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::{
     LOSS, NUMBERS, REPORT, SPLAT, TwinSplat, compare_backward, compare_gradient, compare_splats, device_gradient, f32s,
 };
-use crate::selftest::problems::{deformable_case, deformable_set, fillings};
+use crate::selftest::problems::{deformable_case, fillings, hard_case, moving_set, with_gaussians};
+use crate::selftest::repeats::{ITERATIONS, bits_of, compare_runs, losses};
 use glam::DVec3;
 
 const PROJECT: &[&str] = &[push::DeformableProject::SHADER];
@@ -57,7 +60,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     let (targets, rows, config) = deformable_case()?;
     let mut trainer = DeformableTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
     let (setup, deformable) = (*trainer.setup(), *trainer.deformable_setup());
-    let p = deformable_set(&rows, &deformable, targets.n_phases);
+    let p = moving_set(&rows, &deformable, targets.n_phases);
     upload(gpu, &trainer.grid().motion_grid, &p.grid)?;
     upload(gpu, &trainer.own_motion().own_motion, &p.own)?;
     let images = trainer.images()?;
@@ -95,7 +98,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
 type Shown = Option<(usize, usize, Params)>;
 
 /// Gaussians in all images, `[phase][view][Gaussian]`.
-fn shown_in_images(targets: &Targets, deformable: &DeformableSetup, p: &DeformableParams) -> Vec<Shown> {
+fn shown_in_images(targets: &Targets, deformable: &MotionGridSetup, p: &DeformableParams) -> Vec<Shown> {
     let (n, n_views, n_phases) = (p.rows.len(), targets.n_views, targets.n_phases);
     let at = |splat: usize| {
         let (phase_and_view, i) = (splat / n, splat % n);
@@ -120,7 +123,7 @@ fn compare_filling(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     let mut trainer = DeformableTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
     let (setup, deformable) = (*trainer.setup(), *trainer.deformable_setup());
     let (n, n_phases) = (rows.len(), targets.n_phases);
-    let mut p = deformable_set(&rows, &deformable, n_phases);
+    let mut p = moving_set(&rows, &deformable, n_phases);
     p.filling = fillings(n, n_phases, targets.rest_phase);
     upload(gpu, &trainer.grid().motion_grid, &p.grid)?;
     upload(gpu, &trainer.own_motion().own_motion, &p.own)?;
@@ -176,7 +179,7 @@ fn drawn(targets: &Targets, setup: &GaussianSetup, seen: &[TwinSplat]) -> Vec<f6
 fn compare_motion(
     gpu: &Gpu,
     trainer: &DeformableTrainer,
-    deformable: &DeformableSetup,
+    deformable: &MotionGridSetup,
     (p, gradient): (&DeformableParams, &DeformableParams),
     findings: &mut Findings,
 ) -> Result<()> {
@@ -235,4 +238,48 @@ fn compare_guess(
     }
     findings.numbers(GUESS, "grid", &vectors(gpu, &grid.motion_grid, p.grid.len())?, &flat(&want), NUMBERS);
     Ok(())
+}
+
+/// Compares runs of Gaussians, a set per phase and one set that moves.
+///
+/// # Errors
+/// Device errors.
+pub fn compare_equal_runs(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
+    findings.begin("phase", "24 iterations, losses and Gaussians");
+    let settings = |config: Config| sections::Gaussians { iterations: ITERATIONS, grow_at: 0, ..config.gaussians };
+    let config = with_gaussians(settings(Config::preset(Preset::Fast)));
+    let (targets, rows) = hard_case()?;
+    let run = |stops: &[u32]| -> Result<Vec<u64>> {
+        let mut trainer = GaussianTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
+        let mut bits = losses(stops, |stop| trainer.advance(stop))?;
+        bits.extend(bits_of(&trainer.model()?.rows));
+        Ok(bits)
+    };
+    compare_runs(run, findings)?;
+    let (targets, rows, config) = deformable_case()?;
+    let config = Config { gaussians: settings(config.clone()), ..config };
+    findings.begin("deformable", "24 iterations, losses, Gaussians and their motion");
+    compare_equal_runs_of_one_set(gpu, &targets, &rows, &config, findings)?;
+    findings.begin("deformable", "the same with contrast that comes and goes, and fillings");
+    compare_equal_runs_of_one_set(gpu, &Targets { contrast_comes_and_goes: true, ..targets }, &rows, &config, findings)
+}
+
+/// Compares runs of one set that moves.
+fn compare_equal_runs_of_one_set(
+    gpu: &Gpu,
+    targets: &Targets,
+    rows: &[Gaussian],
+    config: &Config,
+    findings: &mut Findings,
+) -> Result<()> {
+    let run = |stops: &[u32]| -> Result<Vec<u64>> {
+        let mut trainer = DeformableTrainer::with(gpu, targets.clone(), config, &Particles::fresh(rows.to_vec()))?;
+        let mut bits = losses(stops, |stop| trainer.advance(stop))?;
+        let deformable = trainer.deformable()?;
+        bits.extend(bits_of(&deformable.rest.rows));
+        let motion = deformable.grid.iter().chain(&deformable.own).flatten();
+        bits.extend(motion.chain(deformable.filling.iter().flatten()).map(|v| u64::from(v.to_bits())));
+        Ok(bits)
+    };
+    compare_runs(run, findings)
 }

@@ -196,7 +196,7 @@ pub(crate) fn compare_backward(
 pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     findings.begin("phase", "77 Gaussians, 8 images of 33 x 27 pixels");
     let (targets, rows) = hard_case()?;
-    let preset = Config::preset(Preset::Fast);
+    let preset = Config::preset(Preset::default());
     let mut trainer = GaussianTrainer::with(gpu, targets.clone(), &preset, &Particles::fresh(rows.clone()))?;
     let setup = *trainer.setup();
     let all: Vec<(Params, usize)> = rows.iter().map(|g| (params(g), g.phase as usize)).collect();
@@ -243,7 +243,7 @@ pub(crate) fn compare_gradient(got: &[Params], want: &[Params], stages: &[&'stat
 fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     findings.begin("phase", "77 Gaussians, ten updates");
     let (targets, rows) = hard_case()?;
-    let settings = sections::Gaussians { iterations: 12, ..Config::preset(Preset::Fast).gaussians };
+    let settings = sections::Gaussians { iterations: 12, ..Config::preset(Preset::default()).gaussians };
     let config = with_gaussians(settings);
     let mut trainer = GaussianTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
     while trainer.step() < 10 {

@@ -23,7 +23,7 @@ use crate::reference::field::{self, Precision, ShownPhases};
 use crate::reference::{march, step};
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::{Findings, Tolerance, told};
-use crate::selftest::problems::small_config;
+use crate::selftest::problems::{FAST_NETWORK, PAPER_NETWORK, PUBLIC_NETWORK, small_config};
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 
@@ -65,31 +65,31 @@ impl Case {
 
 /// Cases of the f32 layers. Each covers a branch the others do not.
 pub const F32_CASES: &[Case] = &[
-    case(Preset::Paper, &["dynamic.occlusion=1e-3"]),
-    case(Preset::PublicCode, &["dynamic.occlusion=1e-3"]),
-    case(Preset::FastMlp, &[]),
+    case(PAPER_NETWORK, &["dynamic.occlusion=1e-3"]),
+    case(PUBLIC_NETWORK, &["dynamic.occlusion=1e-3"]),
+    case(FAST_NETWORK, &[]),
     // odd bands, five ranks (two vec4), no power of two anywhere, batch of one ray
     case(
-        Preset::FastMlp,
+        FAST_NETWORK,
         &["dynamic.bands=5", "static.ranks=5", "static.grid=7", "train.rays=4", "march.dynamic_samples=33"],
     ),
     // more than 32 depths a lane
-    case(Preset::FastMlp, &["march.dynamic_samples=1100", "train.rays=3", "train.chunk_samples=3500"]),
+    case(FAST_NETWORK, &["march.dynamic_samples=1100", "train.rays=3", "train.chunk_samples=3500"]),
     // a field far below the bend of its softplus, which rays bring back
-    case(Preset::FastMlp, &["dynamic.best_start=false", "dynamic.normalised_shift=-9", "dynamic.min_slope=0.05"]),
+    case(FAST_NETWORK, &["dynamic.best_start=false", "dynamic.normalised_shift=-9", "dynamic.min_slope=0.05"]),
     // a single hidden layer, skip in a deep net, wide layers
-    case(Preset::Paper, &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true"]),
-    case(Preset::PublicCode, &["dynamic.layers=6", "dynamic.skip_layer=3", "dynamic.width=48", "dynamic.latent=12"]),
+    case(PAPER_NETWORK, &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true"]),
+    case(PUBLIC_NETWORK, &["dynamic.layers=6", "dynamic.skip_layer=3", "dynamic.width=48", "dynamic.latent=12"]),
 ];
 
 /// Cases of the layers on matrices. Each covers what the others do not: no skip and a skip layer; the skip layer last; one
 /// layer; odd bands; several chunks; more tiles than workgroups; fewer samples than a tile.
 pub const MATRIX_CASES: &[Case] = &[
-    case(Preset::FastMlp, &["dynamic.width=48", "dynamic.bands=5"]),
-    case(Preset::PublicCode, &["dynamic.occlusion=1e-3", "loss.normalise=true"]),
-    case(Preset::FastMlp, &["dynamic.layers=3", "dynamic.skip_layer=3", "dynamic.width=64", "train.rays=100"]),
-    case(Preset::Paper, &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true", "dynamic.latent=12"]),
-    case(Preset::FastMlp, &["train.rays=1", "march.dynamic_samples=7"]),
+    case(FAST_NETWORK, &["dynamic.width=48", "dynamic.bands=5"]),
+    case(PUBLIC_NETWORK, &["dynamic.occlusion=1e-3", "loss.normalise=true"]),
+    case(FAST_NETWORK, &["dynamic.layers=3", "dynamic.skip_layer=3", "dynamic.width=64", "train.rays=100"]),
+    case(PAPER_NETWORK, &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true", "dynamic.latent=12"]),
+    case(FAST_NETWORK, &["train.rays=1", "march.dynamic_samples=7"]),
 ];
 
 /// Cases on matrices that are compared on images between phases, too. In the other cases some activation is so near zero there

@@ -1,6 +1,5 @@
 //! One iteration of two networks as the fields, stage by stage, as [`super::iteration`] does of the others.
 
-use crate::config::Preset;
 use crate::error::{Error, Result};
 use crate::fields::trainer::FieldsFit;
 use crate::fitting::losses::{NetworkLosses, StepLoss};
@@ -19,6 +18,7 @@ use crate::selftest::iteration::{
     Case, F32_SUMS, ITERATIONS, Sample, Tolerances, compare_update, one_iteration, path_name, pick, precision_of,
     relative, samples,
 };
+use crate::selftest::problems::TWO_NETWORKS;
 use crate::train::trainer::Trainer;
 
 /// Settings with which each loss of two networks shows beside the others.
@@ -58,9 +58,9 @@ const CHUNKS: &[&str] = &["networks.gain=0.5", "train.rays=70"];
 
 /// Configurations that are compared.
 pub const CASES: &[Case] = &[
-    Case { preset: Preset::NerfCa, settings: LARGE },
-    Case { preset: Preset::NerfCa, settings: FAINT },
-    Case { preset: Preset::NerfCa, settings: CHUNKS },
+    Case { preset: TWO_NETWORKS, settings: LARGE },
+    Case { preset: TWO_NETWORKS, settings: FAINT },
+    Case { preset: TWO_NETWORKS, settings: CHUNKS },
 ];
 
 const RAYS: &[&str] = &[push::Batch::SHADER];

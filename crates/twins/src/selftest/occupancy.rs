@@ -1,7 +1,6 @@
 //! Cells in which the dynamic field has been seen empty: the notes of an iteration, and their use by later ones.
 
 use crate::config::Config;
-use crate::config::Preset;
 use crate::error::{Error, Result};
 use crate::fields::data::FieldData;
 use crate::fitting::losses::StepLoss;
@@ -15,7 +14,7 @@ use crate::reference::{march, occupancy};
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::Findings;
 use crate::selftest::iteration::path_name;
-use crate::selftest::problems::small_config;
+use crate::selftest::problems::{FAST_NETWORK, small_config};
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 
@@ -35,7 +34,7 @@ const SETTINGS: &[&str] =
 /// Device errors.
 pub fn compare(gpu: &Gpu, dataset: &Dataset, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
     findings.begin(path_name(tuning.layers), "fast-mlp, a field that does not change");
-    let mut plan = Plan::new(&small_config(Preset::FastMlp, SETTINGS)?, dataset)?;
+    let mut plan = Plan::new(&small_config(FAST_NETWORK, SETTINGS)?, dataset)?;
     let limit = threshold(gpu, dataset, &plan.config, tuning)?;
     plan.data_mut::<FieldData>()?.setup.occupancy_threshold = limit;
     let mut trainer = Trainer::new(gpu, plan, dataset, tuning.clone())?;

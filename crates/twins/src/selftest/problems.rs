@@ -3,10 +3,10 @@
 use crate::config::sections::{self, Deformable};
 use crate::config::{Config, Preset};
 use crate::error::Result;
-use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, Units};
+use crate::gaussians::field::{GaussianField, Gaussians, MovingGaussians, Units};
 use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry};
-use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
+use crate::kernels::layout::{Gaussian, GaussianSetup, MotionGridSetup};
 use crate::methods::dynamic_gaussians::lengths::Lengths;
 use crate::methods::dynamic_gaussians::shared_images::SharedImages;
 use crate::methods::dynamic_gaussians::targets::{PossibleVessel, Targets};
@@ -15,6 +15,15 @@ use crate::reference::dynamic_gaussians::DeformableParams;
 use crate::reference::gaussians::params;
 use crate::scan::small::rays;
 use glam::DVec3;
+
+/// Preset with a network of tuned settings.
+pub const FAST_NETWORK: Preset = Preset::FastMlp;
+/// Preset with a network as the paper states it.
+pub const PAPER_NETWORK: Preset = Preset::Paper;
+/// Preset with a network as the authors' public code has it.
+pub const PUBLIC_NETWORK: Preset = Preset::PublicCode;
+/// Preset whose static field is a network as well.
+pub const TWO_NETWORKS: Preset = Preset::NerfCa;
 
 /// A configuration small enough for f64 twins, on top of a preset.
 ///
@@ -131,7 +140,7 @@ pub fn hard_case() -> Result<(Targets, Vec<Gaussian>)> {
 
 /// Default configuration with the given settings of Gaussians.
 pub fn with_gaussians(gaussians: sections::Gaussians) -> Config {
-    Config { gaussians, ..Config::preset(Preset::Fast) }
+    Config { gaussians, ..Config::preset(Preset::default()) }
 }
 
 /// A deformable set's targets, Gaussians and settings.
@@ -152,14 +161,14 @@ pub fn deformable_case() -> Result<(Targets, Vec<Gaussian>, Config)> {
     targets.places[0].push(corner);
     let mut rows = random_gaussians(31, 1, 11.0, 8);
     rows[3].position = [300.0, 0.0, 0.0];
-    let preset = Config::preset(Preset::Fast);
+    let preset = Config::preset(Preset::default());
     let deformable = Deformable { node: 12.0, smoothness: 0.5, own_penalty: 0.7, ..preset.deformable };
     let gaussians = sections::Gaussians { grow_at: 0, ..preset.gaussians.clone() };
     Ok((targets, rows, Config { deformable, gaussians, ..preset }))
 }
 
 /// A deformable set that already moves: Gaussians at rest, own motion, and a grid filled with waves where it does not rest.
-pub fn deformable_set(rows: &[Gaussian], deformable: &DeformableSetup, n_phases: usize) -> DeformableParams {
+pub fn moving_set(rows: &[Gaussian], deformable: &MotionGridSetup, n_phases: usize) -> DeformableParams {
     let wave = |i: usize, k: f64| {
         let at = |c: f64| f64::from((0.4 * (k * (i as f64 + c)).sin()) as f32);
         DVec3::new(at(0.0), at(0.3), at(0.9))
@@ -204,15 +213,15 @@ fn drawn_set(n: usize, n_phases: u32) -> Gaussians {
 }
 
 /// One set of Gaussians that moves, to be drawn.
-fn drawn_deformable(n: usize, n_phases: u32) -> DeformableGaussians {
+fn drawn_deformable(n: usize, n_phases: u32) -> MovingGaussians {
     const REST_PHASE: u32 = 1;
-    let setup = DeformableSetup {
+    let setup = MotionGridSetup {
         n_nodes: 4,
         half_side: 30.0,
         inverse_step: 0.05,
         n_basis: 4,
         rest_phase: REST_PHASE,
-        ..DeformableSetup::default()
+        ..MotionGridSetup::default()
     };
     let wave = |i: usize| [0.7, 1.1, 1.9].map(|k| (1.5 * (k * i as f64).sin()) as f32);
     let vector = |i: usize| [wave(i)[0], wave(i)[1], wave(i)[2], 0.0];
@@ -220,10 +229,10 @@ fn drawn_deformable(n: usize, n_phases: u32) -> DeformableGaussians {
     let grid = (0..n_phases as usize * 64).map(|i| if rests(i) { [0.0; 4] } else { vector(i) }).collect();
     let mut rest = drawn_set(n, 1);
     (rest.n_phases, rest.setup.n_phases) = (n_phases as usize, n_phases);
-    DeformableGaussians { rest, setup, grid, own: (0..n * 4).map(vector).collect(), filling: None }
+    MovingGaussians { rest, setup, grid, own: (0..n * 4).map(vector).collect(), filling: None }
 }
 
 /// Dynamic fields of three phases to be drawn, one of each form.
-pub fn drawn_fields() -> [DynamicGaussians; 2] {
-    [DynamicGaussians::PerPhase(drawn_set(231, 3)), DynamicGaussians::Deformable(drawn_deformable(77, 3))]
+pub fn drawn_fields() -> [GaussianField; 2] {
+    [GaussianField::PerPhase(drawn_set(231, 3)), GaussianField::Moving(drawn_deformable(77, 3))]
 }

@@ -6,10 +6,10 @@ use crate::error::Result;
 use crate::fitting::shown::SetsFit;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
-use crate::kernels::layout::{GaussianSetup, R2Gaussian, R2Setup, R2Turn, Splat};
+use crate::kernels::layout::{PictureTurn, R2Gaussian, Splat};
 use crate::kernels::push::{self, PushConstants};
 use crate::methods::r2_gaussian::data::R2Data;
-use crate::methods::r2_gaussian::setup::{schedule, turns};
+use crate::methods::r2_gaussian::setup::{R2Setups, schedule, turns};
 use crate::methods::r2_gaussian::state::R2State;
 use crate::methods::r2_gaussian::trainer::R2Trainer;
 use crate::plan::Plan;
@@ -108,7 +108,7 @@ struct Turn<'a> {
 }
 
 impl<'a> Turn<'a> {
-    fn new(data: &'a R2Data, (setup, r2): (&'a GaussianSetup, &'a R2Setup), turn: &R2Turn) -> Turn<'a> {
+    fn new(data: &'a R2Data, (setup, r2, _): R2Setups<'a>, turn: &PictureTurn) -> Turn<'a> {
         let corner = DVec3::from_array(turn.corner.map(f64::from));
         Turn { data, image: turn.image as usize, voxels: VoxelBox { corner, r2, setup } }
     }
@@ -138,13 +138,8 @@ impl<'a> Turn<'a> {
 }
 
 /// Loss and gradient of an iteration by the twins: the loss is the mean over the sets, each of which has its own.
-pub fn twin(
-    data: &R2Data,
-    setups: (&GaussianSetup, &R2Setup),
-    shown: &[R2Turn],
-    all: &[(Params, usize)],
-) -> (f64, Vec<Params>) {
-    let (setup, r2) = setups;
+pub fn twin(data: &R2Data, setups: R2Setups<'_>, shown: &[PictureTurn], all: &[(Params, usize)]) -> (f64, Vec<Params>) {
+    let (setup, _, pictures) = setups;
     let (mut total, mut gradients) = (0.0, vec![[0.0; N_PARAMS]; all.len()]);
     for (set, turn) in shown.iter().enumerate() {
         let turn = Turn::new(data, setups, turn);
@@ -153,7 +148,7 @@ pub fn twin(
             turn.see(p).inspect(|seen| seen.splat(setup, &mut picture));
             turn.voxels.splat(p, &mut voxels);
         }
-        let (loss, by_pixel) = ssim::picture_loss(&picture, &turn.target(), data.width, r2.ssim_weight.into());
+        let (loss, by_pixel) = ssim::picture_loss(&picture, &turn.target(), data.width, pictures.ssim_weight.into());
         let (variation, by_voxel) = turn.voxels.variation(&voxels);
         total += loss + variation;
         for (at, (p, _)) in all.iter().enumerate().filter(|(_, (_, of))| *of == set) {
@@ -245,7 +240,7 @@ impl Iteration<'_> {
         seen: &[Option<ViewProjection>],
         findings: &mut Findings,
     ) -> Result<OfPictures> {
-        let (buffers, data, (setup, r2)) = (self.fit.buffers(), self.fit.data(), self.fit.setups());
+        let (buffers, data, (setup, r2, pictures)) = (self.fit.buffers(), self.fit.data(), self.fit.setups());
         let (n, stride, width) = (data.n_pixels(), setup.image_stride as usize, data.width);
         let sums: Vec<i32> = self.gpu.download(&buffers.splat_images, 0, shown.len() * stride)?;
         let rows: Vec<[f32; 4]> = self.gpu.download(&buffers.ssim_row_sums, 0, shown.len() * stride)?;
@@ -282,7 +277,7 @@ impl Iteration<'_> {
                 let want = ssim::along_rows(&own, width);
                 findings.numbers(SSIM_ROWS_BACK, "factors along rows", &got, &want, NUMBERS);
             }
-            let (loss, want) = ssim::picture_loss(x, y, width, r2.ssim_weight.into());
+            let (loss, want) = ssim::picture_loss(x, y, width, pictures.ssim_weight.into());
             of.loss += loss;
             let got = &slopes[here];
             findings.numbers(RESIDUAL, "gradient of the pictures", got, &want, NUMBERS);

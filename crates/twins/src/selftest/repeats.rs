@@ -1,30 +1,25 @@
 //! Runs that must come to the same bits when they are done again, however many iterations go into a submit.
 
-use crate::config::{Config, Preset, sections};
 use crate::error::Result;
-use crate::gaussians::particles::Particles;
 use crate::gpu::device::Gpu;
 use crate::kernels::layout::Gaussian;
 use crate::kernels::tuning::Tuning;
-use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
-use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
-use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::Findings;
 use crate::selftest::iteration::path_name;
-use crate::selftest::problems::{deformable_case, hard_case, small_config, with_gaussians};
+use crate::selftest::problems::{FAST_NETWORK, small_config};
 use crate::train::trainer::Trainer;
 
 const REPEATS: &[&str] = &["equal runs have equal bits"];
 
 /// Iterations of each run.
-const ITERATIONS: u32 = 24;
+pub(crate) const ITERATIONS: u32 = 24;
 /// Where the second run stops on its way, so that its submits differ from the first one's.
 const STOPS: [&[u32]; 2] = [&[ITERATIONS], &[5, 6, ITERATIONS]];
 
 /// Records how many numbers of two equal runs differ. Losses come first.
-fn compare_runs(run: impl Fn(&[u32]) -> Result<Vec<u64>>, findings: &mut Findings) -> Result<()> {
+pub(crate) fn compare_runs(run: impl Fn(&[u32]) -> Result<Vec<u64>>, findings: &mut Findings) -> Result<()> {
     let [whole, parts] = [run(STOPS[0])?, run(STOPS[1])?];
     findings.require(REPEATS, "losses that differ", whole.first() != whole.get(1));
     let differ = whole.iter().zip(&parts).filter(|(a, b)| a != b).count() + whole.len().abs_diff(parts.len());
@@ -38,7 +33,7 @@ fn compare_runs(run: impl Fn(&[u32]) -> Result<Vec<u64>>, findings: &mut Finding
 /// Device errors.
 pub fn compare_network(gpu: &Gpu, dataset: &Dataset, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
     findings.begin(path_name(tuning.layers), "24 iterations, losses and parameters");
-    let config = small_config(Preset::FastMlp, &["dynamic.lr=3e-3", "train.rays=64", "occupancy.start=2"])?;
+    let config = small_config(FAST_NETWORK, &["dynamic.lr=3e-3", "train.rays=64", "occupancy.start=2"])?;
     let run = |stops: &[u32]| -> Result<Vec<u64>> {
         let mut trainer = Trainer::new(gpu, Plan::new(&config, dataset)?, dataset, tuning.clone())?;
         let totals = |stop| Ok(trainer.advance(stop)?.iter().map(|loss| loss.total()).collect());
@@ -49,13 +44,14 @@ pub fn compare_network(gpu: &Gpu, dataset: &Dataset, tuning: &Tuning, findings: 
     compare_runs(run, findings)
 }
 
-fn bits_of(rows: &[Gaussian]) -> Vec<u64> {
+/// Returns the bits of Gaussians.
+pub(crate) fn bits_of(rows: &[Gaussian]) -> Vec<u64> {
     let words: &[u32] = bytemuck::cast_slice(rows);
     words.iter().map(|word| u64::from(*word)).collect()
 }
 
 /// Bits of the losses of a run with these stops on the way; `advance` goes towards a stop, and returns nothing once there.
-fn losses(stops: &[u32], mut advance: impl FnMut(u32) -> Result<Vec<f64>>) -> Result<Vec<u64>> {
+pub(crate) fn losses(stops: &[u32], mut advance: impl FnMut(u32) -> Result<Vec<f64>>) -> Result<Vec<u64>> {
     let mut bits = Vec::new();
     for stop in stops {
         loop {
@@ -67,48 +63,4 @@ fn losses(stops: &[u32], mut advance: impl FnMut(u32) -> Result<Vec<f64>>) -> Re
         }
     }
     Ok(bits)
-}
-
-/// Compares runs of Gaussians, a set per phase and one set that moves.
-///
-/// # Errors
-/// Device errors.
-pub fn compare_gaussians(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
-    findings.begin("phase", "24 iterations, losses and Gaussians");
-    let settings = |config: Config| sections::Gaussians { iterations: ITERATIONS, grow_at: 0, ..config.gaussians };
-    let config = with_gaussians(settings(Config::preset(Preset::Fast)));
-    let (targets, rows) = hard_case()?;
-    let run = |stops: &[u32]| -> Result<Vec<u64>> {
-        let mut trainer = GaussianTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
-        let mut bits = losses(stops, |stop| trainer.advance(stop))?;
-        bits.extend(bits_of(&trainer.model()?.rows));
-        Ok(bits)
-    };
-    compare_runs(run, findings)?;
-    let (targets, rows, config) = deformable_case()?;
-    let config = Config { gaussians: settings(config.clone()), ..config };
-    findings.begin("deformable", "24 iterations, losses, Gaussians and their motion");
-    compare_deformable(gpu, &targets, &rows, &config, findings)?;
-    findings.begin("deformable", "the same with contrast that comes and goes, and fillings");
-    compare_deformable(gpu, &Targets { contrast_comes_and_goes: true, ..targets }, &rows, &config, findings)
-}
-
-/// Compares runs of one set that moves.
-fn compare_deformable(
-    gpu: &Gpu,
-    targets: &Targets,
-    rows: &[Gaussian],
-    config: &Config,
-    findings: &mut Findings,
-) -> Result<()> {
-    let run = |stops: &[u32]| -> Result<Vec<u64>> {
-        let mut trainer = DeformableTrainer::with(gpu, targets.clone(), config, &Particles::fresh(rows.to_vec()))?;
-        let mut bits = losses(stops, |stop| trainer.advance(stop))?;
-        let deformable = trainer.deformable()?;
-        bits.extend(bits_of(&deformable.rest.rows));
-        let motion = deformable.grid.iter().chain(&deformable.own).flatten();
-        bits.extend(motion.chain(deformable.filling.iter().flatten()).map(|v| u64::from(v.to_bits())));
-        Ok(bits)
-    };
-    compare_runs(run, findings)
 }

@@ -6,7 +6,9 @@ use crate::error::Result;
 use crate::fitting::shown::SetsFit;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
-use crate::kernels::layout::{R2Turn, Splat, XEnd, XGaussian, XKey, XList, XSpan, XStatistics};
+use crate::kernels::layout::{
+    BlendEnd, BlendGaussian, BlendKey, BlendList, BlendSpan, PictureTurn, Splat, XStatistics,
+};
 use crate::kernels::push::{self, PushConstants};
 use crate::methods::x_gaussian::data::XData;
 use crate::methods::x_gaussian::setup::{schedule, turns};
@@ -22,10 +24,10 @@ use crate::selftest::gaussians::f32s;
 use glam::DVec2;
 use std::ops::Range;
 
-const PROJECT: &[&str] = &[push::XProject::SHADER];
-const SORT: &[&str] = &[push::XSortCount::SHADER, push::XSortScan::SHADER, push::XSortMove::SHADER];
-const LISTS: &[&str] = &[push::XLists::SHADER];
-const BLEND: &[&str] = &[push::XBlend::SHADER];
+const PROJECT: &[&str] = &[push::BlendProject::SHADER];
+const SORT: &[&str] = &[push::BlendSortCount::SHADER, push::BlendSortScan::SHADER, push::BlendSortMove::SHADER];
+const LISTS: &[&str] = &[push::BlendLists::SHADER];
+const BLEND: &[&str] = &[push::BlendPicture::SHADER];
 const COMPARE: &[&str] =
     &[push::SsimRows::SHADER, push::SsimColumns::SHADER, push::SsimRowsBack::SHADER, push::PictureResidual::SHADER];
 const BLEND_BACK: &[&str] = &[push::XBlendBack::SHADER];
@@ -83,7 +85,7 @@ fn data_of(config: &Config, width: usize, height: usize) -> Result<XData> {
 fn anywhere(data: &XData, n: u32) -> XState {
     let value = |i: u32, k: u32| normal(9, STREAM_JITTER, i, k);
     let pixel_mm = 100.0 * data.pixel;
-    let row = |i: u32| XGaussian {
+    let row = |i: u32| BlendGaussian {
         position: [0, 1, 2].map(|k| (0.3 * data.half_mm * value(i, k)) as f32),
         opacity: (0.5 + 1.5 * value(i, 3)) as f32,
         log_scale: [4, 5, 6].map(|k| ((1.5 * pixel_mm).ln() + 0.5 * value(i, k)) as f32),
@@ -128,7 +130,7 @@ fn sums_of(parts: &[Sums]) -> Sums {
 }
 
 /// Loss and gradient of an iteration by the twins: the loss is the mean over the sets, each of which has its own.
-pub fn twin(fit: &XTrainer, shown: &[R2Turn], all: &[(Params, usize)]) -> (f64, Vec<Params>) {
+pub fn twin(fit: &XTrainer, shown: &[PictureTurn], all: &[(Params, usize)]) -> (f64, Vec<Params>) {
     let (data, (setup, x)) = (fit.data(), fit.setups());
     let (mut total, mut gradients) = (0.0, vec![[0.0; N_PARAMS]; all.len()]);
     for (set, turn) in shown.iter().enumerate() {
@@ -212,7 +214,7 @@ struct Iteration<'a> {
     gpu: &'a Gpu,
     fit: &'a XTrainer,
     state: &'a XState,
-    shown: Vec<R2Turn>,
+    shown: Vec<PictureTurn>,
 }
 
 impl Iteration<'_> {
@@ -237,7 +239,7 @@ impl Iteration<'_> {
     fn compare_splats(&self, seen: &[Option<Projection>], findings: &mut Findings) -> Result<()> {
         let (particles, (_, x)) = (self.fit.particles().0, self.fit.setups());
         let splats: Vec<Splat> = self.get(&particles.splats, seen.len())?;
-        let spans: Vec<XSpan> = self.get(&particles.x_spans, seen.len())?;
+        let spans: Vec<BlendSpan> = self.get(&particles.blend_spans, seen.len())?;
         let (mut worst, mut visible) = (0f64, 0);
         let mut places = Vec::new();
         for (i, ((splat, span), want)) in splats.iter().zip(&spans).zip(seen).enumerate() {
@@ -266,13 +268,13 @@ impl Iteration<'_> {
     }
 
     /// Compares the device's order with that of the host, which is stable, too.
-    fn compare_order(&self, findings: &mut Findings) -> Result<Vec<XKey>> {
+    fn compare_order(&self, findings: &mut Findings) -> Result<Vec<BlendKey>> {
         let (particles, n) = (self.fit.particles().0, self.state.rows.len());
         // An odd number of passes leaves them in the other buffer.
         let is_odd = self.fit.setups().1.n_sets > 1;
-        let sorted = if is_odd { &particles.x_keys_moved } else { &particles.x_keys };
-        let order: Vec<XKey> = self.get(sorted, n)?;
-        let spans: Vec<XSpan> = self.get(&particles.x_spans, n)?;
+        let sorted = if is_odd { &particles.blend_keys_moved } else { &particles.blend_keys };
+        let order: Vec<BlendKey> = self.get(sorted, n)?;
+        let spans: Vec<BlendSpan> = self.get(&particles.blend_spans, n)?;
         let mut want = order.clone();
         want.sort_by_key(|key| key.index);
         let complete = want.iter().enumerate().all(|(i, key)| key.index as usize == i);
@@ -297,15 +299,15 @@ impl Iteration<'_> {
     }
 
     /// Compares the device's lists of each set's tiles, and returns them: `[set][tile]`.
-    fn compare_lists(&self, order: &[XKey], findings: &mut Findings) -> Result<Vec<Vec<Vec<usize>>>> {
+    fn compare_lists(&self, order: &[BlendKey], findings: &mut Findings) -> Result<Vec<Vec<Vec<usize>>>> {
         let (particles, (scene, _)) = (self.fit.particles().0, self.fit.buffers());
         let (_, x) = self.fit.setups();
         let n_tiles = (x.tile_columns * x.tile_rows) as usize;
         let n_sets = x.n_sets as usize;
-        let lists: Vec<XList> = self.get(&scene.x_lists, n_tiles * n_sets)?;
-        let items: Vec<u32> = self.get(&particles.x_list_items, x.capacity as usize)?;
-        let spans: Vec<XSpan> = self.get(&particles.x_spans, self.state.rows.len())?;
-        let inside = |span: &XSpan, tile: u32| {
+        let lists: Vec<BlendList> = self.get(&scene.blend_lists, n_tiles * n_sets)?;
+        let items: Vec<u32> = self.get(&particles.blend_list_items, x.capacity as usize)?;
+        let spans: Vec<BlendSpan> = self.get(&particles.blend_spans, self.state.rows.len())?;
+        let inside = |span: &BlendSpan, tile: u32| {
             let (column, row) = (tile % x.tile_columns, tile / x.tile_columns);
             (span.first & 0xffff..span.end & 0xffff).contains(&column)
                 && (span.first >> 16..span.end >> 16).contains(&row)
@@ -314,10 +316,10 @@ impl Iteration<'_> {
         for set in 0..n_sets {
             let mut of_set = Vec::new();
             for tile in 0..n_tiles {
-                let XList { first, count } = lists[set * n_tiles + tile];
+                let BlendList { first, count } = lists[set * n_tiles + tile];
                 let range = first as usize..(first as usize).saturating_add(count as usize);
                 let got: Vec<usize> = items.get(range).unwrap_or_default().iter().map(|i| *i as usize).collect();
-                let of_tile = |key: &&XKey| {
+                let of_tile = |key: &&BlendKey| {
                     let i = key.index as usize;
                     self.state.sets[i] as usize == set && inside(&spans[i], tile as u32)
                 };
@@ -339,9 +341,9 @@ impl Iteration<'_> {
         let ((particles, learning), (scene, fit)) = (self.fit.particles(), self.fit.buffers());
         let (n, stride, n_sets) = (data.n_pixels(), setup.image_stride as usize, lists.len());
         let splats: Vec<Splat> = self.get(&particles.splats, self.state.rows.len())?;
-        let spans: Vec<XSpan> = self.get(&particles.x_spans, self.state.rows.len())?;
+        let spans: Vec<BlendSpan> = self.get(&particles.blend_spans, self.state.rows.len())?;
         let shown: Vec<i32> = self.get(&scene.splat_images, n_sets * stride)?;
-        let ends: Vec<XEnd> = self.get(&scene.x_ends, n_sets * stride)?;
+        let ends: Vec<BlendEnd> = self.get(&scene.blend_ends, n_sets * stride)?;
         let slopes: Vec<f32> = self.get(&fit.splat_image_gradient, n_sets * stride)?;
         let entries: Vec<[f32; 7]> = self.get(&learning.x_entries, x.capacity as usize)?;
         let (mut total, mut of_gaussians) = (0.0, vec![[0.0; 7]; splats.len()]);
@@ -419,7 +421,7 @@ impl Iteration<'_> {
 }
 
 /// Index of the sums of a Gaussian in a tile.
-fn entry_of(span: &XSpan, tile: u32, tile_columns: u32) -> usize {
+fn entry_of(span: &BlendSpan, tile: u32, tile_columns: u32) -> usize {
     let columns = (span.end & 0xffff) - (span.first & 0xffff);
     let from_first = [tile % tile_columns - (span.first & 0xffff), tile / tile_columns - (span.first >> 16)];
     (span.first_entry + from_first[1] * columns + from_first[0]) as usize

@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::export::volumes::grid_over;
-use crate::gaussians::field::DynamicGaussians;
+use crate::gaussians::field::GaussianField;
 use crate::geometry::{MM_PER_UNIT, world_from_lps_mm};
 use crate::model::Model;
 use crate::model::component::Component;
@@ -68,9 +68,9 @@ pub fn vessel_trees(
     let all = options.phases.len() as u64;
     progress(0, all)?;
     let mut finder = Finder::new(renderer, model, options)?;
-    let deformable = model.gaussians.as_ref().and_then(DynamicGaussians::deformable);
+    let moving = model.gaussians.as_ref().and_then(GaussianField::moving);
     let (mut phases, mut measured_mm) = (Vec::new(), Vec::new());
-    if let Some(tree) = deformable {
+    if let Some(tree) = moving {
         let reference = finder.tree(tree.setup.rest_phase)?;
         let carrier = Carrier::new(tree);
         for phase in &options.phases {
@@ -85,9 +85,9 @@ pub fn vessel_trees(
             progress(phases.len() as u64, all)?;
         }
     }
-    let is_filled_over_time = deformable.is_some_and(|set| set.filling.is_some());
+    let is_filled_over_time = moving.is_some_and(|set| set.filling.is_some());
     Ok(BeatTree {
-        reference_phase: deformable.map(|tree| tree.setup.rest_phase),
+        reference_phase: moving.map(|tree| tree.setup.rest_phase),
         threshold_per_mm: finder.threshold_per_mm,
         resolution_mm: finder.resolution_mm,
         spacing_mm: finder.spacing_mm,

@@ -1,13 +1,13 @@
 //! Positions of material points of a moving set of Gaussians at any phase.
 
-use crate::gaussians::field::{DeformableGaussians, scales};
+use crate::gaussians::field::{MovingGaussians, scales};
 use crate::geometry::{lps_mm_from_world, world_from_lps_mm};
 use crate::kernels::layout::Gaussian;
 use glam::{DMat3, DQuat, DVec3};
 
 /// A set of Gaussians that moves points through the beat.
 pub(super) struct Carrier<'a> {
-    tree: &'a DeformableGaussians,
+    tree: &'a MovingGaussians,
     /// Shape of each Gaussian at rest.
     shapes: Vec<Shape>,
 }
@@ -26,7 +26,7 @@ impl Shape {
 }
 
 impl Carrier<'_> {
-    pub(super) fn new(tree: &DeformableGaussians) -> Carrier<'_> {
+    pub(super) fn new(tree: &MovingGaussians) -> Carrier<'_> {
         let shape = |g: Gaussian| {
             let Gaussian { position, rotation, log_density, .. } = g;
             let [w, x, y, z] = rotation.map(f64::from);
@@ -66,12 +66,12 @@ impl Carrier<'_> {
 mod tests {
     use super::*;
     use crate::gaussians::field::{Gaussians, Units};
-    use crate::kernels::layout::{DeformableSetup, GaussianSetup};
+    use crate::kernels::layout::{GaussianSetup, MotionGridSetup};
 
     const PIXEL: f64 = 0.01;
 
     /// Two distant Gaussians, of which the second has an own motion, in a grid that moves everything by (1, 2, 3) pixels.
-    fn tree() -> DeformableGaussians {
+    fn tree() -> MovingGaussians {
         let gaussian = |x: f32| Gaussian {
             position: [x, 0.0, 0.0],
             log_density: 0.0,
@@ -80,7 +80,7 @@ mod tests {
             rotation: [1.0, 0.0, 0.0, 0.0],
         };
         let step = 20.0;
-        DeformableGaussians {
+        MovingGaussians {
             rest: Gaussians {
                 units: Units { pixel: PIXEL, strongest: 1.0 },
                 n_phases: 2,
@@ -91,12 +91,12 @@ mod tests {
                 agreement: None,
                 intensities: None,
             },
-            setup: DeformableSetup {
+            setup: MotionGridSetup {
                 n_nodes: 4,
                 half_side: 30.0,
                 inverse_step: 1.0 / step,
                 n_basis: 2,
-                ..DeformableSetup::default()
+                ..MotionGridSetup::default()
             },
             grid: (0..2).flat_map(|t| vec![[1.0, 2.0, 3.0, 0.0].map(|v: f32| v * t as f32); 64]).collect(),
             own: vec![[0.0; 4], [0.0; 4], [0.0, 0.0, -2.0, 0.0], [0.0; 4]],

@@ -1,11 +1,11 @@
-// Projection of the Gaussians of X-Gaussian in a cone beam, with the intermediate results from which their gradient is
-// computed. Reference implementation: src/methods/x_gaussian/twin.rs.
+// Projection in a cone beam of Gaussians of which nearer ones hide those behind them, with the intermediate results from which their
+// gradient is computed. Reference implementation: src/methods/x_gaussian/twin.rs.
+#include "inc/blend_layout.glsl"
 #include "inc/gaussian.glsl"
 #include "inc/gaussian_gradient.glsl"
 #include "inc/local_projection.glsl"
-#include "inc/r2_layout.glsl"
+#include "inc/picture_layout.glsl"
 #include "inc/softplus.glsl"
-#include "inc/x_layout.glsl"
 
 // Variance that is added to each splat, pixels^2.
 const float LOW_PASS = 0.3;
@@ -22,14 +22,14 @@ const float MIN_ALPHA = 1.0 / 255.0;
 // Transmittance below which the sum of a pixel ends.
 const float MIN_LIGHT = 1e-4;
 
-struct XProjection {
+struct BlendProjection {
     LocalProjection at;
     Splat splat;
 };
 
 // The splat's amplitude is its opacity, and its box is the square of its radius.
-XProjection project_x(XGaussian g, GaussianView view, GaussianSetup setup, XSetup x_setup) {
-    XProjection p;
+BlendProjection project_blended(BlendGaussian g, GaussianView view, GaussianSetup setup, BlendSetup blend_setup) {
+    BlendProjection p;
     p.at = project_locally(g.position, g.rotation, exp(g.log_scale), view, setup);
     vec3 sharp = variance_of(p.at);
     vec3 variance = sharp + LOW_PASS * vec3(1.0, 0.0, 1.0);
@@ -40,20 +40,20 @@ XProjection project_x(XGaussian g, GaussianView view, GaussianSetup setup, XSetu
     p.splat.amplitude = sigmoid(g.opacity);
     p.splat.half_box = vec2(ceil(REACH * sqrt(largest_variance(variance, det))));
     // A Gaussian at the source or behind it is not visible.
-    if (!(p.at.depth > x_setup.nearest)) p.splat.half_box = vec2(-1.0);
+    if (!(p.at.depth > blend_setup.nearest)) p.splat.half_box = vec2(-1.0);
     return p;
 }
 
 // First tile (column, row) that the splat's square touches, and one more than the last; they are equal if it touches none.
-uvec4 tiles_of(Splat splat, XSetup x_setup) {
+uvec4 tiles_of(Splat splat, BlendSetup blend_setup) {
     if (!(splat.half_box.x > 0.0)) return uvec4(0u);
-    vec2 tiles = vec2(float(x_setup.tile_columns), float(x_setup.tile_rows));
+    vec2 tiles = vec2(float(blend_setup.tile_columns), float(blend_setup.tile_rows));
     vec2 first = clamp(trunc((splat.mean - splat.half_box) / float(TILE)), vec2(0.0), tiles);
     vec2 end = clamp(trunc((splat.mean + splat.half_box + float(TILE - 1u)) / float(TILE)), vec2(0.0), tiles);
     return any(lessThanEqual(end, first)) ? uvec4(0u) : uvec4(uvec2(first), uvec2(end));
 }
 
-uvec2 columns_and_rows(XSpan span) {
+uvec2 columns_and_rows(BlendSpan span) {
     return uvec2((span.end & 0xffffu) - (span.first & 0xffffu), (span.end >> 16) - (span.first >> 16));
 }
 
@@ -73,7 +73,7 @@ XAlpha alpha_of(vec3 conic, float opacity, vec2 d) {
 // Gradient with respect to position, opacity (in `log_density`), logarithms of scales, and raw quaternion. With h = dL/d(ln
 // alpha) where alpha depends on the parameters, `linear` = h (1, du, dv) and `square` = h (du^2, du dv, dv^2), summed over the
 // pixels.
-GaussianGradient gradient_x(XGaussian g, XProjection p, GaussianView view, vec3 linear, vec3 square) {
+GaussianGradient gradient_x(BlendGaussian g, BlendProjection p, GaussianView view, vec3 linear, vec3 square) {
     mat2 conic = mat2(p.splat.conic.x, p.splat.conic.y, p.splat.conic.y, p.splat.conic.z);
     mat2 second = mat2(square.x, square.y, square.y, square.z);
     mat2 variance = 0.5 * (conic * second * conic);

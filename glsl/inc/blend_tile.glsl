@@ -1,11 +1,11 @@
-// Tile of 16 x 16 pixels with four pixels in each of 64 lanes. The including file must declare `gaussian_setup` and `x_setup`.
+// Tile of 16 x 16 pixels with four pixels in each of 64 lanes. The including file must declare `gaussian_setup` and `blend_setup`.
 const uint LANES = 64u;
 const uint PIXELS_OF_LANE = 4u;
 
-// Position in x_lists of the workgroup's tile: column (x), row (y) and set (z).
+// Position in blend_lists of the workgroup's tile: column (x), row (y) and set (z).
 uint list_of_workgroup() {
     uvec3 at = gl_WorkGroupID;
-    return (at.z * x_setup.tile_rows + at.y) * x_setup.tile_columns + at.x;
+    return (at.z * blend_setup.tile_rows + at.y) * blend_setup.tile_columns + at.x;
 }
 
 // The `k`-th pixel of the lane.

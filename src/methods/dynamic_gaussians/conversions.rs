@@ -1,7 +1,7 @@
 //! Conversion of Gaussians to other units and of a deformable set to another grid, needed when data are added to a fitted field.
 
-use crate::gaussians::field::{DeformableGaussians, Gaussians, Units, vector};
-use crate::kernels::layout::{DeformableSetup, Gaussian};
+use crate::gaussians::field::{Gaussians, MovingGaussians, Units, vector};
+use crate::kernels::layout::{Gaussian, MotionGridSetup};
 use glam::DVec3;
 
 impl Gaussians {
@@ -19,10 +19,10 @@ impl Gaussians {
     }
 }
 
-impl DeformableGaussians {
+impl MovingGaussians {
     /// Returns this deformable set in the units of `rest` on another grid with the same number of basis functions of own motion.
     /// Displacements are evaluated at the new nodes; outside the old grid they have the values on its faces.
-    pub fn on_grid(&self, rest: Gaussians, setup: DeformableSetup) -> DeformableGaussians {
+    pub fn on_grid(&self, rest: Gaussians, setup: MotionGridSetup) -> MovingGaussians {
         let pixels = self.rest.units.pixel / rest.units.pixel;
         let pack = |v: DVec3| {
             let [x, y, z] = (v * pixels).as_vec3().to_array();
@@ -35,7 +35,7 @@ impl DeformableGaussians {
         };
         let at = |phase: usize, i: usize| pack(self.carried(node(i), phase as f64) - node(i));
         let grid = (0..rest.n_phases).flat_map(|phase| (0..setup.nodes()).map(move |i| (phase, i)));
-        DeformableGaussians {
+        MovingGaussians {
             grid: grid.map(|(phase, i)| at(phase, i)).collect(),
             own: self.own.iter().map(|v| pack(vector(v))).collect(),
             filling: self.filling.clone(),
@@ -53,19 +53,19 @@ mod tests {
 
     const N_PHASES: usize = 3;
 
-    fn grid(n_nodes: u32, half_side: f32) -> DeformableSetup {
-        DeformableSetup {
+    fn grid(n_nodes: u32, half_side: f32) -> MotionGridSetup {
+        MotionGridSetup {
             n_nodes,
             half_side,
             inverse_step: inverse_step(n_nodes, half_side),
             n_basis: 2,
             rest_phase: 1,
-            ..DeformableSetup::default()
+            ..MotionGridSetup::default()
         }
     }
 
     /// Returns a deformable set whose displacements are linear in position, so that any grid represents them exactly.
-    fn deformable() -> DeformableGaussians {
+    fn deformable() -> MovingGaussians {
         let setup = grid(5, 40.0);
         let node = |i: usize| DVec3::new((i % 5) as f64, (i / 5 % 5) as f64, (i / 25) as f64) * 20.0 - 40.0;
         let displacement = |phase: usize, x: DVec3| {
@@ -79,7 +79,7 @@ mod tests {
             phase: 1,
             rotation: [1.0, 0.1, 0.2, 0.3],
         };
-        DeformableGaussians {
+        MovingGaussians {
             rest: Gaussians {
                 units: Units { pixel: 0.01, strongest: 0.5 },
                 n_phases: N_PHASES,
@@ -111,9 +111,9 @@ mod tests {
         }
         assert_eq!(other.filling, deformable.filling);
         for (was, is) in deformable.rest.rows.iter().zip(&other.rest.rows) {
-            let width = |g, of: &DeformableGaussians| scales(g, &of.rest.setup) * of.rest.units.pixel;
+            let width = |g, of: &MovingGaussians| scales(g, &of.rest.setup) * of.rest.units.pixel;
             let density =
-                |g: &Gaussian, of: &DeformableGaussians| f64::from(g.log_density).exp() * of.rest.units.attenuation();
+                |g: &Gaussian, of: &MovingGaussians| f64::from(g.log_density).exp() * of.rest.units.attenuation();
             assert!(width(was, &deformable).distance(width(is, &other)) < 1e-8);
             assert!((density(was, &deformable) / density(is, &other) - 1.0).abs() < 1e-6);
         }

@@ -1,5 +1,5 @@
 // One pass of the sort of Gaussians by set and depth: stable, by four bits. A workgroup has a block of 1024 keys, and each lane
-// has 16 consecutive keys. The including file must declare `push` with n_keys, n_blocks and shift, `x_keys` and `x_set_of`.
+// has 16 consecutive keys. The including file must declare `push` with n_keys, n_blocks and shift, `blend_keys` and `blend_set_of`.
 
 // Number of keys of a lane, and of a block.
 const uint KEYS_OF_LANE = 16u;
@@ -12,8 +12,8 @@ const uint DEPTH_BITS = 32u;
 // [digit][lane]
 shared uint of_lanes[DIGITS * gl_WorkGroupSize.x];
 
-uint digit_of(XKey key) {
-    uint bits = push.shift < DEPTH_BITS ? key.depth >> push.shift : x_set_of[key.index] >> (push.shift - DEPTH_BITS);
+uint digit_of(BlendKey key) {
+    uint bits = push.shift < DEPTH_BITS ? key.depth >> push.shift : blend_set_of[key.index] >> (push.shift - DEPTH_BITS);
     return bits & (DIGITS - 1u);
 }
 
@@ -28,6 +28,6 @@ void count_digits() {
     uint lane = gl_LocalInvocationID.x;
     for (uint digit = 0u; digit < DIGITS; digit++) of_lanes[digit * gl_WorkGroupSize.x + lane] = 0u;
     uvec2 own = keys_of_lane();
-    for (uint i = own.x; i < own.y; i++) of_lanes[digit_of(x_keys[i]) * gl_WorkGroupSize.x + lane] += 1u;
+    for (uint i = own.x; i < own.y; i++) of_lanes[digit_of(blend_keys[i]) * gl_WorkGroupSize.x + lane] += 1u;
     barrier();
 }

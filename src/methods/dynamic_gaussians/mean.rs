@@ -1,8 +1,8 @@
 //! The mean of several dynamic fields that were fitted to the same images, and their agreement. Errors that the fits do not share
 //! are fainter in the mean.
 
-use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, FitAgreement, Gaussians, scales, vessel_density};
-use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
+use crate::gaussians::field::{FitAgreement, GaussianField, Gaussians, MovingGaussians, scales, vessel_density};
+use crate::kernels::layout::{Gaussian, GaussianSetup, MotionGridSetup};
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 use std::f64::consts::TAU;
@@ -10,21 +10,20 @@ use std::f64::consts::TAU;
 /// Attenuation, as a share of the density of the vessels, from which a place counts as vessel.
 const VESSEL_SHARE: f64 = 0.2;
 
-impl DynamicGaussians {
+impl GaussianField {
     /// Returns the field whose attenuation is the mean of those of `members` times `factor`; `None` without members or where their
     /// forms differ. All were fitted to the same images. The mean of deformable sets has the grid of the first: own motion of the
     /// Gaussians takes up what theirs differs by, exactly at the phases and between them.
-    pub fn mean(members: &[DynamicGaussians], factor: f64) -> Option<DynamicGaussians> {
+    pub fn mean(members: &[GaussianField], factor: f64) -> Option<GaussianField> {
         let first = members.first()?;
         let share = (factor / members.len() as f64).ln() as f32;
         let fainter = |g: &Gaussian| Gaussian { log_density: g.log_density + share, ..*g };
         let rows = members.iter().flat_map(|member| member.rows().rows.iter().map(fainter)).collect();
         let rows = Gaussians { rows, agreement: agreement(members), ..first.rows().clone() };
-        if members.iter().all(|member| member.deformable().is_none()) {
-            return Some(DynamicGaussians::PerPhase(rows));
+        if members.iter().all(|member| member.moving().is_none()) {
+            return Some(GaussianField::PerPhase(rows));
         }
-        let sets: Vec<&DeformableGaussians> =
-            members.iter().map(DynamicGaussians::deformable).collect::<Option<_>>()?;
+        let sets: Vec<&MovingGaussians> = members.iter().map(GaussianField::moving).collect::<Option<_>>()?;
         let grid = sets.first()?;
         let own = sets.iter().flat_map(|set| (0..set.rest.rows.len()).flat_map(|i| own_on_grid(set, i, grid)));
         let is_full = sets.iter().all(|set| set.filling.is_none());
@@ -32,10 +31,10 @@ impl DynamicGaussians {
             Some(filling) => filling.clone(),
             None => vec![1.0; set.rest.rows.len() * set.rest.n_phases],
         });
-        Some(DynamicGaussians::Deformable(DeformableGaussians {
+        Some(GaussianField::Moving(MovingGaussians {
             own: own.collect(),
             filling: (!is_full).then(|| filling.collect()),
-            setup: DeformableSetup { n_basis: full_basis(rows.n_phases) as u32, ..grid.setup },
+            setup: MotionGridSetup { n_basis: full_basis(rows.n_phases) as u32, ..grid.setup },
             rest: rows,
             grid: grid.grid.clone(),
         }))
@@ -48,7 +47,7 @@ fn full_basis(n_phases: usize) -> usize {
 }
 
 /// Returns the own motion that a Gaussian of a set needs on another grid, as coefficients of [`full_basis`] functions.
-fn own_on_grid(set: &DeformableGaussians, index: usize, grid: &DeformableGaussians) -> Vec<[f32; 4]> {
+fn own_on_grid(set: &MovingGaussians, index: usize, grid: &MovingGaussians) -> Vec<[f32; 4]> {
     let (n, rest_phase) = (set.rest.n_phases, set.setup.rest_phase as usize);
     let at_rest = DVec3::from_array(set.rest.rows[index].position.map(f64::from));
     let own = |since_rest: usize| {
@@ -79,7 +78,7 @@ struct Found {
 }
 
 /// Returns the agreement of fits; `None` with fewer than two, and for fields without attenuation.
-fn agreement(members: &[DynamicGaussians]) -> Option<FitAgreement> {
+fn agreement(members: &[GaussianField]) -> Option<FitAgreement> {
     let n_phases = members.first()?.rows().n_phases;
     if members.len() < 2 {
         return None;
@@ -106,13 +105,13 @@ fn agreement(members: &[DynamicGaussians]) -> Option<FitAgreement> {
 }
 
 /// Looks for the Gaussians of a fit at a phase in all other fits.
-fn found(members: &[DynamicGaussians], fit: usize, phase: usize) -> Vec<Found> {
+fn found(members: &[GaussianField], fit: usize, phase: usize) -> Vec<Found> {
     let field = &members[fit];
     let indices: Vec<usize> = match field {
-        DynamicGaussians::PerPhase(sets) => {
+        GaussianField::PerPhase(sets) => {
             (0..sets.rows.len()).filter(|i| sets.rows[*i].phase as usize == phase).collect()
         }
-        DynamicGaussians::Deformable(set) => (0..set.rest.rows.len()).collect(),
+        GaussianField::Moving(set) => (0..set.rest.rows.len()).collect(),
     };
     let others: Vec<(Vec<Shape>, f64)> = members
         .iter()
@@ -135,13 +134,13 @@ fn found(members: &[DynamicGaussians], fit: usize, phase: usize) -> Vec<Found> {
     indices.into_iter().zip(field.at(phase)).map(look).collect()
 }
 
-impl DynamicGaussians {
+impl GaussianField {
     /// Returns, at points in pixels, the share of the other fits that have a vessel there: the mean over the Gaussians of a phase, each
     /// weighted by its density at the point; 0 where there is none. `None` for a single fit, and where it is not known.
     pub fn agreement_at(&self, points: &[DVec3], phase: usize) -> Option<Vec<f64>> {
         let rows = self.rows();
         let shares = rows.agreement.as_ref().map(|agreement| &agreement.of_gaussians).filter(|all| !all.is_empty())?;
-        let is_shown = |i: &usize| self.deformable().is_some() || rows.rows[*i].phase as usize == phase;
+        let is_shown = |i: &usize| self.moving().is_some() || rows.rows[*i].phase as usize == phase;
         let shares: Vec<f64> = (0..rows.rows.len()).filter(is_shown).map(|i| f64::from(shares[i])).collect();
         let shapes: Vec<Shape> = self.at(phase).iter().map(|g| Shape::new(g, &rows.setup)).collect();
         let at = |point: &DVec3| {
@@ -197,7 +196,7 @@ mod tests {
     const NODES: u32 = 3;
 
     /// A deformable set whose grid and own motion are drawn from a seed.
-    fn set(seed: u32, n_phases: usize, n_basis: u32, rest_phase: u32) -> DynamicGaussians {
+    fn set(seed: u32, n_phases: usize, n_basis: u32, rest_phase: u32) -> GaussianField {
         let number = |round: usize, i: usize| (uniform01(seed, 7, round as u32, i as u32) - 0.5) as f32;
         let rows: Vec<Gaussian> = (0..4)
             .map(|i| Gaussian {
@@ -206,13 +205,13 @@ mod tests {
                 ..Gaussian::default()
             })
             .collect();
-        let setup = DeformableSetup {
+        let setup = MotionGridSetup {
             n_nodes: NODES,
             half_side: 12.0,
             inverse_step: inverse_step(NODES, 12.0),
             n_basis,
             rest_phase,
-            ..DeformableSetup::default()
+            ..MotionGridSetup::default()
         };
         let vectors = |round: usize, n: usize| -> Vec<[f32; 4]> {
             (0..n).map(|i| [number(round, 3 * i), number(round, 3 * i + 1), number(round, 3 * i + 2), 0.0]).collect()
@@ -231,7 +230,7 @@ mod tests {
             intensities: None,
             agreement: None,
         };
-        DynamicGaussians::Deformable(DeformableGaussians { rest, setup, grid, own, filling: None })
+        GaussianField::Moving(MovingGaussians { rest, setup, grid, own, filling: None })
     }
 
     #[test]
@@ -239,7 +238,7 @@ mod tests {
         for (n_phases, rest_phase) in [(10, 3), (7, 0), (4, 1)] {
             let basis = 2 * ((n_phases as u32 - 1) / 2);
             let members = [set(1, n_phases, basis, rest_phase), set(2, n_phases, basis, rest_phase)];
-            let mean = DynamicGaussians::mean(&members, 1.5).unwrap();
+            let mean = GaussianField::mean(&members, 1.5).unwrap();
             for phase in [0.0, 1.0, 2.4, n_phases as f64 - 0.3] {
                 let want: Vec<Gaussian> = members.iter().flat_map(|member| member.at_time(phase)).collect();
                 let got = mean.at_time(phase);
@@ -256,14 +255,14 @@ mod tests {
     #[test]
     fn gaussians_of_the_mean_keep_their_filling() {
         let members = [set(1, 4, 2, 0), set(2, 4, 2, 0)].map(|field| {
-            let DynamicGaussians::Deformable(set) = field else { unreachable!() };
+            let GaussianField::Moving(set) = field else { unreachable!() };
             set
         });
         let [full, mut filled] = members;
         filled.filling = Some((1..=16).map(|i| i as f32 / 16.0).collect());
-        let fields = [full, filled.clone()].map(DynamicGaussians::Deformable);
-        let mean = DynamicGaussians::mean(&fields, 1.0).unwrap();
-        let filling = mean.deformable().unwrap().filling.clone().unwrap();
+        let fields = [full, filled.clone()].map(GaussianField::Moving);
+        let mean = GaussianField::mean(&fields, 1.0).unwrap();
+        let filling = mean.moving().unwrap().filling.clone().unwrap();
         assert!(filling[..16].iter().all(|f| *f == 1.0));
         assert_eq!(Some(&filling[16..]), filled.filling.as_deref());
     }
@@ -271,27 +270,27 @@ mod tests {
     #[test]
     fn fields_agree_where_both_have_vessels() {
         let one = set(1, 4, 2, 0);
-        let twice = DynamicGaussians::mean(&[one.clone(), one.clone()], 1.0).unwrap();
-        let overall = |field: &DynamicGaussians| field.rows().agreement.as_ref().map(|agreement| agreement.overall);
+        let twice = GaussianField::mean(&[one.clone(), one.clone()], 1.0).unwrap();
+        let overall = |field: &GaussianField| field.rows().agreement.as_ref().map(|agreement| agreement.overall);
         assert_eq!(overall(&twice), Some(1.0));
-        let away = |field: &DynamicGaussians, n: usize| {
-            let DynamicGaussians::Deformable(mut set) = field.clone() else { unreachable!() };
+        let away = |field: &GaussianField, n: usize| {
+            let GaussianField::Moving(mut set) = field.clone() else { unreachable!() };
             set.rest.rows.iter_mut().take(n).for_each(|g| g.position[0] += 200.0);
-            DynamicGaussians::Deformable(set)
+            GaussianField::Moving(set)
         };
-        let mean = |n: usize| DynamicGaussians::mean(&[one.clone(), away(&one, n)], 1.0).unwrap();
+        let mean = |n: usize| GaussianField::mean(&[one.clone(), away(&one, n)], 1.0).unwrap();
         assert_eq!((overall(&mean(4)), overall(&mean(1))), (Some(0.0), Some(0.75)));
-        assert_eq!(overall(&DynamicGaussians::mean(&[one], 1.0).unwrap()), None);
+        assert_eq!(overall(&GaussianField::mean(&[one], 1.0).unwrap()), None);
     }
 
     #[test]
     fn a_place_has_the_share_of_the_other_fits_that_have_a_vessel_there() {
         let one = set(1, 4, 2, 0);
-        let DynamicGaussians::Deformable(mut elsewhere) = one.clone() else { unreachable!() };
+        let GaussianField::Moving(mut elsewhere) = one.clone() else { unreachable!() };
         // The first Gaussian of the third fit lies where no other fit has a vessel.
         elsewhere.rest.rows[0].position[0] += 200.0;
-        let members = [one.clone(), one.clone(), DynamicGaussians::Deformable(elsewhere)];
-        let mean = DynamicGaussians::mean(&members, 1.0).unwrap();
+        let members = [one.clone(), one.clone(), GaussianField::Moving(elsewhere)];
+        let mean = GaussianField::mean(&members, 1.0).unwrap();
         let of_gaussians = &mean.rows().agreement.as_ref().unwrap().of_gaussians;
         assert_eq!(of_gaussians[..], [0.5, 1.0, 1.0, 1.0, 0.5, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 1.0]);
         let centre = |i: usize| DVec3::from_array(mean.at(2)[i].position.map(f64::from));
