@@ -144,13 +144,13 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<TestPart<'a>> {
         (
             "views of many Gaussians".into(),
             Box::new(move |findings| {
-                blobs::compare_maxima(gpu, &methods::r2_gaussian::selftest::small_config(&[])?, tuning, findings)
+                blobs::compare_maxima(gpu, &r2_gaussian::small_config(&[])?, tuning, findings)
             }),
         ),
         ("volumes of Gaussians".into(), Box::new(move |findings| blobs::compare_cells(gpu, tuning, findings))),
         (
             "equal runs of Gaussians".into(),
-            Box::new(move |findings| methods::dynamic_gaussians::selftest::compare_equal_runs(gpu, findings)),
+            Box::new(move |findings| dynamic_gaussians::compare_equal_runs(gpu, findings)),
         ),
         ("projections of volumes".into(), Box::new(move |findings| projections::compare(gpu, findings))),
     ]
