@@ -1,13 +1,12 @@
 //! Gaussians: projection against quadrature, twins against finite differences and PyTorch, kernels against twins.
 
 use crate::common;
-use crate::common::{drop_first_view, expect_agreement, expect_silence, gpu, phantom, relative_error, whiten};
+use crate::common::{drop_first_view, expect_agreement, expect_silence, gpu, phantom, relative_error};
 use crate::golden_file::Golden;
 use glam::DVec3;
 use nertca_vk::config::sections;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Result;
-use nertca_vk::fields::scale::dynamic_half;
 use nertca_vk::gaussians::field::{DeformableGaussians, Gaussians};
 use nertca_vk::gaussians::particles::Particles;
 use nertca_vk::gaussians::view::SplatView;
@@ -427,124 +426,5 @@ fn the_default_phantom_is_reconstructed() {
             assert!(dice >= min[index], "{form}, {n_views} views: {dice}");
         }
     }
-    expect_silence(gpu);
-}
-
-/// Runs both forms on the datasets whose folders `GAUSSIANS_DATA` names, separated by colons, for the table of
-/// docs/log/2026-11-performance.md.
-#[test]
-#[ignore = "a measurement, of folders named by GAUSSIANS_DATA"]
-fn forms_on_data() {
-    let gpu = gpu();
-    let folders = std::env::var("GAUSSIANS_DATA").unwrap();
-    for (folder, n_views, noise) in folders
-        .split(':')
-        .flat_map(|folder| [(4, 0.0), (3, 0.0), (4, 0.1)].map(|(views, noise)| (folder, views, noise)))
-    {
-        let mut dataset = Dataset::open(folder.as_ref()).unwrap();
-        let half = dynamic_half(&config(), &dataset);
-        if noise > 0.0 {
-            let clean = SoftMotion::new(&dataset, half, 32);
-            let strongest = clean.views.iter().map(|v| f64::from(v.background.strongest)).fold(0.0, f64::max);
-            whiten(&mut dataset, noise * strongest);
-        }
-        if n_views == 3 {
-            drop_first_view(&mut dataset);
-        }
-        for seed in 1..=3 {
-            for (form, train) in FORMS {
-                let config = Config { seed, ..config() };
-                let motion = SoftMotion::new(&dataset, half, 112);
-                let targets = Targets::new(&dataset, &motion, &config.gaussians).unwrap();
-                let start = Instant::now();
-                let model = train(&gpu, targets, &config).unwrap();
-                let seconds = start.elapsed().as_secs_f64();
-                let dice = dice(&model, &dataset);
-                println!(
-                    "{folder}, {n_views} views, noise {noise}, seed {seed}, {form}: Dice {dice:.3}, {seconds:.1} s"
-                );
-            }
-        }
-    }
-}
-
-#[test]
-fn maxima_are_those_of_the_field() {
-    let targets = targets(33, 27, 2);
-    let setup = GaussianSetup { cut: 6.0, ..setup::gaussian_setup(&targets, &config().gaussians) };
-    let model = Gaussians {
-        units: units(),
-        n_phases: 2,
-        setup,
-        rows: random_gaussians(40, 2, 8.0, 6),
-        step: 0,
-        is_crowd: false,
-        agreement: None,
-        intensities: None,
-    };
-    let view = &targets.views[1];
-    let seen = maxima(&model, view, 33, 27, 1);
-    let field: Vec<Params> = model.at(1).map(params).collect();
-    let mut largest = 0f64;
-    for (pixel, value) in seen.iter().enumerate().step_by(13) {
-        let ray = view.ray((pixel % 33) as f64, (pixel / 33) as f64);
-        let middle = view.project(DVec3::ZERO).0;
-        // The expected value is found by brute force, from all Gaussians and with small steps.
-        let at = |k: i32| view.source + ray * (middle + 0.05 * f64::from(k));
-        let sum = |x: DVec3| field.iter().map(|p| reference::density(p, &setup, x)).sum::<f64>();
-        let want = (-600..=600).map(|k| sum(at(k))).fold(0.0, f64::max) * units().attenuation();
-        largest = largest.max(want);
-        // Steps of a quarter of a pixel miss a peak of scale 0.4 by at most 5 %, tails beyond 3.2 sigma by 0.6 %.
-        assert!((value - want).abs() < 0.06 * want + 1e-4, "pixel {pixel}: {value} against {want}");
-    }
-    assert!(largest > 1.0, "the case must show something: {largest}");
-}
-
-#[test]
-fn tree_twin_gradient_is_the_derivative_of_its_loss() {
-    let (targets, rows, Config { deformable: settings, .. }) = deformable_case().unwrap();
-    let setup = GaussianSetup { cut: 12.0, ..setup::gaussian_setup(&targets, &config().gaussians) };
-    let tree = setup::deformable_setup(&targets, &settings);
-    let mut p = deformable_set(&rows[..7], &tree, targets.n_phases);
-    p.filling = fillings(7, targets.n_phases, targets.rest_phase);
-    let (_, _, gradient) = loss_and_gradient(&targets, &setup, &tree, &p);
-    let check = |what: &str, want: f64, change: &dyn Fn(&mut DeformableParams, f64)| {
-        let loss = |h: f64| {
-            let mut moved = p.clone();
-            change(&mut moved, h);
-            loss_and_gradient(&targets, &setup, &tree, &moved).1
-        };
-        let h = 1e-6;
-        let difference = (loss(h) - loss(-h)) / (2.0 * h);
-        assert!((difference - want).abs() <= 1e-5 * want.abs() + 1e-5, "{what}: {difference} against {want}");
-        want.abs() > 1e-3
-    };
-    let mut seen = 0;
-    for i in (0..p.own.len()).step_by(7) {
-        seen += usize::from(check("own motion", gradient.own[i].y, &|p, h| p.own[i].y += h));
-    }
-    let rest = targets.rest_phase * tree.nodes()..(targets.rest_phase + 1) * tree.nodes();
-    for i in (0..p.grid.len()).filter(|i| !rest.contains(i)).step_by(23) {
-        seen += usize::from(check("grid", gradient.grid[i].x, &|p, h| p.grid[i].x += h));
-    }
-    for i in 0..7 {
-        seen += usize::from(check("log-scale", gradient.rows[i][5], &|p, h| p.rows[i][5] += h));
-    }
-    let mut filled = 0;
-    for i in (0..p.filling.len()).filter(|i| i % targets.n_phases != targets.rest_phase) {
-        filled += usize::from(check("filling", gradient.filling[i], &|p, h| p.filling[i] += h));
-    }
-    assert!(seen > 10 && filled > 10, "the case must have gradients");
-    assert!(gradient.grid[rest].iter().all(|g| *g == DVec3::ZERO), "the grid rests at a phase");
-}
-
-#[test]
-fn tree_kernels_match_their_twin() {
-    let gpu = gpu();
-    expect_agreement(|findings| selftest::compare(&gpu, findings));
-    let (targets, rows, config) = deformable_case().unwrap();
-    let trainer = DeformableTrainer::with(&gpu, targets.clone(), &config, &Particles::fresh(rows.clone())).unwrap();
-    assert_eq!(trainer.deformable().unwrap().expand().rows.len(), rows.len() * targets.n_phases);
-    drop(trainer);
     expect_silence(gpu);
 }
