@@ -160,7 +160,7 @@
 /**
  * Version of this header, second number (minor).
  */
-#define NERTCA_VERSION_MINOR 3
+#define NERTCA_VERSION_MINOR 4
 
 /**
  * Version of this header, third number (patch).

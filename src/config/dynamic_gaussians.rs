@@ -108,8 +108,8 @@ section! {
 
 /// Returns the defaults of the Gaussians for all presets; the paper does not use Gaussians.
 ///
-/// The numbers were tuned on the default phantom. `docs/log` holds the measurements of `clear_at`, `faint` and `link`; those of the other
-/// numbers were not kept, so a change of them needs measurements of its own.
+/// The numbers were tuned on the default phantom. `docs/tried.md` holds the measurements of `clear_at`, `faint`, `min_scale` and `link`;
+/// those of the other numbers were not kept, so a change of them needs measurements of its own.
 pub(super) fn gaussians() -> Gaussians {
     Gaussians {
         form: GaussianForm::None,
@@ -142,8 +142,8 @@ pub(super) fn gaussians() -> Gaussians {
 
 /// Returns the defaults of the deformable set of Gaussians for all presets; the paper does not use it.
 ///
-/// The numbers were tuned on the default phantom. `docs/log` holds the measurements of `smoothness`; those of the other numbers were not
-/// kept, so a change of them needs measurements of its own.
+/// The numbers were tuned on the default phantom. `docs/tried.md` holds the measurements of `smoothness` and `node`; those of the other numbers
+/// were not kept, so a change of them needs measurements of its own.
 pub(super) fn deformable() -> Deformable {
     Deformable {
         warm_iterations: 60,

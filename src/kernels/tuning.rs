@@ -96,7 +96,7 @@ impl MatrixTuning {
     };
 
     /// Sizes for NVIDIA's GPUs and for GPUs of unknown vendors. The deviations of the next two follow from their compilers'
-    /// statistics (docs/log/2026-11-performance.md).
+    /// statistics (docs/tried.md).
     pub const NVIDIA: MatrixTuning = MatrixTuning {
         workgroups: 264,
         largest_tile: 128,

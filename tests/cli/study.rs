@@ -238,30 +238,65 @@ fn a_run_that_fails_is_a_row() {
     assert!(page.contains("data:image/png;base64,") && page.contains("b.m.s1 failed"));
 }
 
-/// Measured results make the tables beside them, and a page with one plot for each data set.
+const TABLES: [&str; 3] = ["table.md", "table.csv", "table.tex"];
+
+/// Makes the tables of a study in a directory, and returns their texts.
+fn tables(file: &Path, directory: &Path) -> [String; 3] {
+    ok(&["table", text(file), "-o", text(directory)]);
+    TABLES.map(|table| std::fs::read_to_string(directory.join(table)).unwrap())
+}
+
+/// Measured results in the repository remain results of their studies: they make the tables beside them, to the bit, and a page with
+/// one plot for each data set. A changed number changes the tables.
 #[test]
 fn measured_results_make_their_tables_and_plots() {
     let studies = Path::new(SMOKE).parent().unwrap();
-    for (name, plots) in [("scaled-table1", 6), ("scaled-table2", 2), ("ablation", 2)] {
+    for (name, plots, runs) in [("scaled-table1", 6, 90), ("scaled-table2", 2, 18), ("ablation", 2, 36)] {
         let directory = tempfile::tempdir().unwrap();
         let (file, out) = (studies.join(format!("{name}.toml")), directory.path());
-        let measured = studies.join("measured").join(name);
-        for run in std::fs::read_dir(measured.join("runs")).unwrap() {
-            let (run, id) = (run.as_ref().unwrap().path(), run.as_ref().unwrap().file_name());
-            std::fs::create_dir_all(out.join("runs").join(&id)).unwrap();
-            std::fs::copy(run.join("result.json"), out.join("runs").join(&id).join("result.json")).unwrap();
-        }
-        ok(&["table", text(&file), "-o", text(out)]);
-        for table in ["table.md", "table.csv", "table.tex"] {
-            let read = |directory: &Path| std::fs::read_to_string(directory.join(table)).unwrap();
-            assert!(read(out) == read(&measured), "{name}/{table} is not the table of its results");
-        }
+        let (measured, results) = (studies.join("measured").join(name), out.join("results.jsonl"));
+        let lines = std::fs::read_to_string(measured.join("results.jsonl")).unwrap();
+        assert_eq!(lines.lines().count(), runs, "{name}");
+        std::fs::write(&results, &lines).unwrap();
+        let expected = TABLES.map(|table| std::fs::read_to_string(measured.join(table)).unwrap());
+        assert!(tables(&file, out) == expected, "{name}: the tables are not those of its results");
+        ok(&["collect", text(&file), "-o", text(out)]);
+        assert!(std::fs::read_to_string(&results).unwrap() == lines, "{name}: collecting changes the results");
         let printed = ok(&["report", text(&file), "-o", text(out)]);
         let pictures: Vec<&str> = printed.lines().filter(|line| line.ends_with(".svg")).collect();
         assert_eq!(pictures.len(), plots, "{printed}");
         let plot = std::fs::read_to_string(pictures[0]).unwrap();
         assert!(plot.contains("XCAT-like, ") && plot.contains(", NVIDIA H100"), "data and devices have names");
+        std::fs::write(&results, lines.replacen("\"psnr\":1", "\"psnr\":2", 1)).unwrap();
+        let changed = tables(&file, out);
+        assert!((0..3).all(|table| changed[table] != expected[table]), "{name}: a changed number is not seen");
     }
+}
+
+/// A result in a run's directory counts before the line of the run. Collected, it makes the same tables without the directory.
+#[test]
+fn results_are_collected() {
+    let studies = Path::new(SMOKE).parent().unwrap();
+    let (file, directory) = (studies.join("ablation.toml"), tempfile::tempdir().unwrap());
+    let (out, results) = (directory.path(), directory.path().join("results.jsonl"));
+    std::fs::copy(studies.join("measured/ablation/results.jsonl"), &results).unwrap();
+    let (before, run) = (tables(&file, out), "xcat-4v.fast.s2");
+    // A scheduler gets the file of a run whose result is a line.
+    ok(&["one", text(&file), run, "-o", text(out), "--any-commit"]);
+    let result = out.join("runs").join(run).join("result.json");
+    let mut outcome: Value = serde_json::from_slice(&std::fs::read(&result).unwrap()).unwrap();
+    assert!(tables(&file, out) == before);
+    outcome["scores"]["dice"] = 0.125.into();
+    std::fs::write(&result, outcome.to_string()).unwrap();
+    let with_directory = tables(&file, out);
+    assert!(with_directory != before);
+    let printed = ok(&["collect", text(&file), "-o", text(out)]);
+    assert!(printed.contains("36 results"), "{printed}");
+    std::fs::remove_dir_all(out.join("runs")).unwrap();
+    assert!(tables(&file, out) == with_directory);
+    std::fs::write(&results, "{}\n").unwrap();
+    let message = output(&["table", text(&file), "-o", text(out)]).stderr;
+    assert!(String::from_utf8_lossy(&message).contains("results.jsonl"), "a damaged line is named");
 }
 
 #[cfg(unix)]
@@ -365,30 +400,4 @@ fn ctrl_c_saves() {
     let first: Value = serde_json::from_str(ended.lines().next().unwrap()).unwrap();
     assert_eq!(first["event"], "started");
     assert!(first["step"].as_u64().unwrap() > 0, "it goes on: {first}");
-}
-
-/// Results in the repository remain results of its studies, and its tables are made from them: a new setting must not
-/// invalidate them.
-#[test]
-fn kept_results_are_of_their_studies_and_make_their_tables() {
-    let root = crate::root::root().join("studies");
-    for name in ["scaled-table1", "scaled-table2", "ablation"] {
-        let (kept, home) = (root.join("measured").join(name), tempfile::tempdir().unwrap());
-        let file = root.join(format!("{name}.toml"));
-        let mut results = 0;
-        for run in std::fs::read_dir(kept.join("runs")).unwrap() {
-            let run = run.unwrap().path();
-            let copy = home.path().join("runs").join(run.file_name().unwrap());
-            std::fs::create_dir_all(&copy).unwrap();
-            std::fs::copy(run.join("result.json"), copy.join("result.json")).unwrap();
-            results += 1;
-        }
-        let said = output(&["table", text(&file), "-o", text(home.path())]);
-        let words = String::from_utf8_lossy(&said.stderr);
-        assert!(said.status.success() && !words.contains("omitted"), "{name}, {results} results: {words}");
-        for table in ["table.md", "table.csv", "table.tex"] {
-            let [made, there] = [home.path(), &kept].map(|dir| std::fs::read_to_string(dir.join(table)).unwrap());
-            assert!(made == there, "{name}/{table} is not what its results make");
-        }
-    }
 }

@@ -18,6 +18,7 @@ mod between_phases;
 mod calibration;
 mod check;
 mod degradations;
+mod documents;
 mod few_phases;
 mod golden;
 mod golden_training;

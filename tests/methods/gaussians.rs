@@ -1,13 +1,12 @@
 //! Gaussians: projection against quadrature, twins against finite differences and PyTorch, kernels against twins.
 
 use crate::common;
-use crate::common::{drop_first_view, expect_agreement, expect_silence, gpu, phantom, relative_error, whiten};
+use crate::common::{drop_first_view, expect_agreement, expect_silence, gpu, phantom, relative_error};
 use crate::golden_file::Golden;
 use glam::DVec3;
 use nertca_vk::config::sections;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Result;
-use nertca_vk::fields::scale::dynamic_half;
 use nertca_vk::gaussians::field::{Gaussians, MovingGaussians};
 use nertca_vk::gaussians::particles::Particles;
 use nertca_vk::gaussians::view::SplatView;
@@ -429,44 +428,6 @@ fn the_default_phantom_is_reconstructed() {
         }
     }
     expect_silence(gpu);
-}
-
-/// Runs both forms on the datasets whose folders `GAUSSIANS_DATA` names, separated by colons, for the table of
-/// docs/log/2026-11-performance.md.
-#[test]
-#[ignore = "a measurement, of folders named by GAUSSIANS_DATA"]
-fn forms_on_data() {
-    let gpu = gpu();
-    let folders = std::env::var("GAUSSIANS_DATA").unwrap();
-    for (folder, n_views, noise) in folders
-        .split(':')
-        .flat_map(|folder| [(4, 0.0), (3, 0.0), (4, 0.1)].map(|(views, noise)| (folder, views, noise)))
-    {
-        let mut dataset = Dataset::open(folder.as_ref()).unwrap();
-        let half = dynamic_half(&config(), &dataset);
-        if noise > 0.0 {
-            let clean = SoftMotion::new(&dataset, half, 32);
-            let strongest = clean.views.iter().map(|v| f64::from(v.background.strongest)).fold(0.0, f64::max);
-            whiten(&mut dataset, noise * strongest);
-        }
-        if n_views == 3 {
-            drop_first_view(&mut dataset);
-        }
-        for seed in 1..=3 {
-            for (form, train) in FORMS {
-                let config = Config { seed, ..config() };
-                let motion = SoftMotion::new(&dataset, half, 112);
-                let targets = Targets::new(&dataset, &motion, &config.gaussians).unwrap();
-                let start = Instant::now();
-                let model = train(&gpu, targets, &config).unwrap();
-                let seconds = start.elapsed().as_secs_f64();
-                let dice = dice(&model, &dataset);
-                println!(
-                    "{folder}, {n_views} views, noise {noise}, seed {seed}, {form}: Dice {dice:.3}, {seconds:.1} s"
-                );
-            }
-        }
-    }
 }
 
 #[test]

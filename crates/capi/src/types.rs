@@ -728,7 +728,7 @@ pub const NERTCA_ABI_VERSION: u32 = 0;
 /// Version of this header, first number (major).
 pub const NERTCA_VERSION_MAJOR: u32 = 0;
 /// Version of this header, second number (minor).
-pub const NERTCA_VERSION_MINOR: u32 = 3;
+pub const NERTCA_VERSION_MINOR: u32 = 4;
 /// Version of this header, third number (patch).
 pub const NERTCA_VERSION_PATCH: u32 = 0;
 

@@ -11,7 +11,7 @@ use nertca_vk_study::COMMIT;
 use nertca_vk_study::events::StudyEvent;
 use nertca_vk_study::file;
 use nertca_vk_study::markup::{csv, latex, markdown};
-use nertca_vk_study::outcome::Outcome;
+use nertca_vk_study::outcome::{RESULTS, Results};
 use nertca_vk_study::plan::{Run, RunFingerprint, Study};
 use nertca_vk_study::queue::work_off;
 use nertca_vk_study::table::Table;
@@ -42,6 +42,9 @@ pub enum StudyCommand {
     List(ListArgs),
     /// Write table.md, table.csv and table.tex into DIR, and the first to stdout.
     Table(PlaceArgs),
+    /// Write results.jsonl into DIR: the results of all runs, one JSON object per line. Tables and report are made from it where a run
+    /// has no directory.
+    Collect(PlaceArgs),
     /// Write report.html into DIR: the table, Dice over time, and pictures of all methods; and dice-DATA.svg, Dice over time
     /// for each data set.
     Report(PlaceArgs),
@@ -138,6 +141,7 @@ pub fn run(global: &GlobalOptions, args: &StudyArgs) -> Result<()> {
         StudyCommand::One(args) => one(global, args),
         StudyCommand::List(args) => list(args),
         StudyCommand::Table(args) => table(args),
+        StudyCommand::Collect(args) => collect(args),
         StudyCommand::Report(args) => report(args),
     }
 }
@@ -152,7 +156,7 @@ fn at_work<T>(
     warn_of_edits();
     let cancel = stop_flag()?;
     let place = Workplace {
-        directory: &args.place.out,
+        results: Results::open(&args.place.out)?,
         open: &|| global.open_device(),
         close: &|gpu| global.close_device(gpu),
         tune: &|gpu, config, dataset| global.training_tuning(gpu, config, dataset),
@@ -215,18 +219,16 @@ struct Listed<'a> {
 fn list(args: &ListArgs) -> Result<()> {
     let study = args.study.read()?;
     let runs = study.runs();
+    let results = args.out.as_deref().map(Results::open).transpose()?;
     let mut listed = Vec::new();
     for run in &runs {
-        let state = match &args.out {
+        let state = match &results {
             None => None,
-            Some(directory) => {
-                let of = if args.any_commit { Outcome::of_any_commit } else { Outcome::of };
-                Some(match of(&study, directory, run)? {
-                    None => "waiting",
-                    Some(outcome) if outcome.failure.is_some() => "failed",
-                    Some(_) => "scored",
-                })
-            }
+            Some(results) => Some(match results.of(&study, run, args.any_commit)? {
+                None => "waiting",
+                Some(outcome) if outcome.failure.is_some() => "failed",
+                Some(_) => "scored",
+            }),
         };
         let (data, method) = (study.data[run.data].id.as_str(), &study.methods[run.method]);
         let (iterations, fingerprint) = (study.config(run).train.iterations, study.fingerprint(run)?);
@@ -250,6 +252,12 @@ fn table(args: &PlaceArgs) -> Result<()> {
         files::write_atomic(&args.out.join(name), text.as_bytes())?;
     }
     out!("{}", text.trim_end());
+    Ok(())
+}
+
+fn collect(args: &PlaceArgs) -> Result<()> {
+    let results = Results::open(&args.out)?.collect(&args.study.read()?)?;
+    out!("{}: {results} results", args.out.join(RESULTS).display());
     Ok(())
 }
 

@@ -7,7 +7,7 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 use nertca_vk::error::Result;
 use nertca_vk::files;
 use nertca_vk_study::data::DataSet;
-use nertca_vk_study::outcome::{CurvePoint, Outcome, run_directory};
+use nertca_vk_study::outcome::{CurvePoint, Outcome, Results, run_directory};
 use nertca_vk_study::plan::{Run, Study};
 use nertca_vk_study::scores::Score;
 use nertca_vk_study::table::{Cell, Table};
@@ -91,11 +91,9 @@ fn heading(set: &DataSet) -> String {
 
 /// Returns the runs that have a result for the study's current inputs.
 fn finished(study: &Study, directory: &Path) -> Result<Vec<Finished>> {
-    let mut finished = Vec::new();
+    let (results, mut finished) = (Results::open(directory)?, Vec::new());
     for run in study.runs() {
-        let outcome = Outcome::read(&run_directory(directory, &run))?;
-        let wanted = study.fingerprint(&run)?;
-        if let Some(outcome) = outcome.filter(|outcome| outcome.fingerprint.asks_the_same(&wanted)) {
+        if let Some(outcome) = results.of(study, &run, true)? {
             finished.push(Finished { run, outcome });
         }
     }

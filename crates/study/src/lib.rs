@@ -6,7 +6,7 @@
 //! 3. [`mod@table`] puts outcomes beside [`published`] values; [`markup`] writes tables as Markdown, CSV and LaTeX
 //!
 //! A study's directory holds `data/` (phantoms, shared between methods), `runs/ID/` (run directories, each with its
-//! `result.json`) and `locks/`. See `docs/studies.md`.
+//! `result.json`), `results.jsonl` (results that were collected) and `locks/`. See `docs/studies.md`.
 
 pub mod data;
 pub mod events;

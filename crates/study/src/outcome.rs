@@ -1,4 +1,5 @@
-//! Result of a run of a study: `result.json`, written atomically at the end of the run.
+//! Results of the runs of a study. A run writes its result as `result.json` into its directory at its end. `results.jsonl` in the study's
+//! directory has one result per line, of runs whose directories need not be there.
 
 use crate::plan::{Run, RunFingerprint, Study};
 use crate::scores::Score;
@@ -7,13 +8,17 @@ use nertca_vk::files;
 use nertca_vk_runs::run::history::Validated;
 use nertca_vk_vessels::score::eval::Evaluation;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Name of the file inside a run directory.
 pub const RESULT: &str = "result.json";
+/// Name of the file with the results of many runs, inside the directory of a study.
+pub const RESULTS: &str = "results.jsonl";
 const FORMAT: &str = "nertca-study-result";
 const VERSION: u32 = 1;
 const MAX_BYTES: u64 = 16 << 20;
+const MAX_RESULTS_BYTES: u64 = 1 << 30;
 
 /// Result of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -179,45 +184,16 @@ impl Outcome {
         Ok(files::write_atomic(&directory.join(RESULT), files::pretty_json(self)?.as_bytes())?)
     }
 
-    /// Reads the result in a run directory; none if there is none yet.
-    ///
-    /// # Errors
-    /// [`Error::Data`] for a file of another kind or version; [`Error::Io`].
-    pub fn read(directory: &Path) -> Result<Option<Outcome>> {
-        let file = directory.join(RESULT);
-        if !file.exists() {
-            return Ok(None);
-        }
-        let outcome: Outcome = serde_json::from_slice(&files::read_limited(&file, MAX_BYTES)?)
-            .map_err(|e| Error::data(&file, format!("line {}", e.line()), e.to_string()))?;
+    /// Parses a result that begins at a line of a file.
+    fn parse(text: &str, file: &Path, first_line: usize) -> Result<Outcome> {
+        let outcome: Outcome = serde_json::from_str(text)
+            .map_err(|e| Error::data(file, format!("line {}", first_line + e.line() - 1), e.to_string()))?;
         if outcome.format != FORMAT || outcome.version != VERSION {
             let found = format!("`{}` version {}", outcome.format, outcome.version);
-            return Err(Error::data(
-                &file,
-                "format",
-                format!("is {found}, but `{FORMAT}` version {VERSION} is expected"),
-            ));
+            let problem = format!("the format is {found}, but `{FORMAT}` version {VERSION} is expected");
+            return Err(Error::data(file, format!("line {first_line}"), problem));
         }
-        Ok(Some(outcome))
-    }
-
-    /// Result of a run if it was made from exactly these data, with this configuration and this program.
-    ///
-    /// # Errors
-    /// Errors of [`Outcome::read`].
-    pub fn of(study: &Study, directory: &Path, run: &Run) -> Result<Option<Outcome>> {
-        let wanted = study.fingerprint(run)?;
-        Ok(Outcome::read(&run_directory(directory, run))?.filter(|outcome| outcome.fingerprint == wanted))
-    }
-
-    /// Result of a run if it was made from exactly these data, with this configuration, by any commit of the program.
-    ///
-    /// # Errors
-    /// Errors of [`Outcome::read`].
-    pub fn of_any_commit(study: &Study, directory: &Path, run: &Run) -> Result<Option<Outcome>> {
-        let wanted = study.fingerprint(run)?;
-        let found = Outcome::read(&run_directory(directory, run))?;
-        Ok(found.filter(|outcome| outcome.fingerprint.asks_the_same(&wanted)))
+        Ok(outcome)
     }
 
     /// Value of a score, if the run has it.
@@ -238,5 +214,75 @@ impl Outcome {
             Score::Minutes => Some(self.seconds.training / 60.0),
             Score::Fps => scores.fps,
         }
+    }
+}
+
+/// Results in the directory of a study.
+#[derive(Debug)]
+pub struct Results<'a> {
+    /// Directory of the study.
+    pub directory: &'a Path,
+    /// Lines of `results.jsonl`, by the name of the run.
+    collected: BTreeMap<String, Outcome>,
+}
+
+impl<'a> Results<'a> {
+    /// Opens the results in the directory of a study.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for a `results.jsonl` of another kind or version; [`Error::Io`].
+    pub fn open(directory: &'a Path) -> Result<Results<'a>> {
+        let file = directory.join(RESULTS);
+        let mut collected = BTreeMap::new();
+        if file.exists() {
+            for (number, line) in files::read_text(&file, MAX_RESULTS_BYTES)?.lines().enumerate() {
+                let outcome = Outcome::parse(line, &file, number + 1)?;
+                collected.insert(outcome.run.clone(), outcome);
+            }
+        }
+        Ok(Results { directory, collected })
+    }
+
+    /// Result of a run: the file in its directory, or else its line; none if there is neither.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for a file of another kind or version; [`Error::Io`].
+    pub fn read(&self, run: &Run) -> Result<Option<Outcome>> {
+        let file = run_directory(self.directory, run).join(RESULT);
+        if file.exists() {
+            return Outcome::parse(&files::read_text(&file, MAX_BYTES)?, &file, 1).map(Some);
+        }
+        Ok(self.collected.get(&run.id).cloned())
+    }
+
+    /// Result of a run if it was made from exactly these data, with this configuration and, unless results of any commit count,
+    /// with this program.
+    ///
+    /// # Errors
+    /// Errors of [`Results::read`].
+    pub fn of(&self, study: &Study, run: &Run, any_commit: bool) -> Result<Option<Outcome>> {
+        let wanted = study.fingerprint(run)?;
+        let counts = |made: &RunFingerprint| if any_commit { made.asks_the_same(&wanted) } else { *made == wanted };
+        Ok(self.read(run)?.filter(|outcome| counts(&outcome.fingerprint)))
+    }
+
+    /// Writes `results.jsonl`: the results of all runs of a study, and earlier lines of other runs, in the order of their names. Returns
+    /// the number of lines.
+    ///
+    /// # Errors
+    /// Errors of [`Results::read`] and of writing.
+    pub fn collect(mut self, study: &Study) -> Result<usize> {
+        for run in study.runs() {
+            if let Some(outcome) = self.read(&run)? {
+                self.collected.insert(run.id, outcome);
+            }
+        }
+        let mut text = Vec::new();
+        for outcome in self.collected.values() {
+            serde_json::to_writer(&mut text, outcome).map_err(|e| Error::Internal(e.to_string()))?;
+            text.push(b'\n');
+        }
+        files::write_atomic(&self.directory.join(RESULTS), &text)?;
+        Ok(self.collected.len())
     }
 }

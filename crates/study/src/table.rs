@@ -2,7 +2,7 @@
 
 use crate::data::DataSet;
 use crate::layout::{Dimension, TableLayout};
-use crate::outcome::{Outcome, run_directory};
+use crate::outcome::{Outcome, Results};
 use crate::plan::{Method, Study};
 use crate::scores::Score;
 use nertca_vk::error::Result;
@@ -94,12 +94,12 @@ impl Entry {
 }
 
 /// Results of the runs of one method on one data set.
-struct Results {
+struct Group {
     of: usize,
     outcomes: Vec<Outcome>,
 }
 
-impl Results {
+impl Group {
     fn state(&self, score: Score) -> State {
         let values: Vec<f64> = self.outcomes.iter().filter_map(|outcome| outcome.score(score)).collect();
         if let Some((mean, deviation)) = spread(&values) {
@@ -132,16 +132,17 @@ impl Table {
     /// # Errors
     /// Errors of results that cannot be read.
     pub fn gather(study: &Study, directory: &Path) -> Result<Table> {
+        let results = Results::open(directory)?;
         let mut gathered = Gathered::default();
         let mut entries = Vec::new();
         for (data, set) in study.data.iter().enumerate() {
             let mut of_set = Vec::new();
             for (method, m) in study.methods.iter().enumerate() {
-                let results = gathered.results(study, directory, (data, method))?;
+                let group = gathered.group(study, &results, (data, method))?;
                 let published =
                     |score| study.published.as_ref()?.value(m.published.as_ref()?, &set.name, set.views, score);
                 of_set.extend(study.table.scores.iter().map(|score| {
-                    let cell = Cell { state: results.state(*score), published: published(*score), best: false };
+                    let cell = Cell { state: group.state(*score), published: published(*score), best: false };
                     entry(set, &m.label, *score, cell)
                 }));
             }
@@ -242,11 +243,11 @@ struct Gathered {
 }
 
 impl Gathered {
-    fn results(&mut self, study: &Study, directory: &Path, (data, method): (usize, usize)) -> Result<Results> {
+    fn group(&mut self, study: &Study, results: &Results<'_>, (data, method): (usize, usize)) -> Result<Group> {
         let runs = study.seeds.iter().map(|seed| study.run_of(data, method, *seed));
-        let mut results = Results { of: study.seeds.len(), outcomes: Vec::new() };
+        let mut group = Group { of: study.seeds.len(), outcomes: Vec::new() };
         for run in runs {
-            let Some(outcome) = Outcome::read(&run_directory(directory, &run))? else { continue };
+            let Some(outcome) = results.read(&run)? else { continue };
             if !outcome.fingerprint.asks_the_same(&study.fingerprint(&run)?) {
                 self.others += 1;
                 continue;
@@ -258,9 +259,9 @@ impl Gathered {
             self.failures.extend(outcome.failure.iter().map(|failure| format!("{} failed: {failure}", run.id)));
             let warnings = outcome.scores.iter().flat_map(|scores| &scores.warnings);
             self.warnings.extend(warnings.map(|warning| format!("{}: {warning}", run.id)));
-            results.outcomes.push(outcome);
+            group.outcomes.push(outcome);
         }
-        Ok(results)
+        Ok(group)
     }
 
     fn notes(self, study: &Study) -> Vec<String> {

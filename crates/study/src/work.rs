@@ -1,7 +1,7 @@
 //! One run of a study, from its data to its result.
 
 use crate::events::StudyEvent;
-use crate::outcome::{CurvePoint, Outcome, RESULT, RunScores, Seconds, run_directory};
+use crate::outcome::{CurvePoint, Outcome, RESULT, Results, RunScores, Seconds, run_directory};
 use crate::plan::{Run, RunFingerprint, Study};
 use nertca_vk::checkpoint::{self, newest_model};
 use nertca_vk::config::Config;
@@ -38,8 +38,8 @@ pub type Observe<'a> = &'a mut dyn FnMut(&StudyEvent<'_>);
 
 /// Resources and options of the work on runs.
 pub struct Workplace<'a> {
-    /// Directory of the study.
-    pub directory: &'a Path,
+    /// Results in the directory of the study.
+    pub results: Results<'a>,
     /// Opens the device of a run. Each run opens its own, so that a lost device affects no other run.
     pub open: Open<'a>,
     /// Checks the device after its run; an error ends the work.
@@ -72,30 +72,30 @@ impl Workplace<'_> {
     /// Result of a run that need not be repeated.
     ///
     /// # Errors
-    /// Errors of [`Outcome::read`].
+    /// Errors of [`Results::read`].
     pub fn done(&self, study: &Study, run: &Run) -> Result<Option<Outcome>> {
-        let outcome = if self.any_commit {
-            Outcome::of_any_commit(study, self.directory, run)?
-        } else {
-            Outcome::of(study, self.directory, run)?
-        };
+        let outcome = self.results.of(study, run, self.any_commit)?;
         Ok(outcome.filter(|outcome| outcome.failure.is_none() || !self.retry_failed))
     }
 
     /// Does a run, resumes one that was interrupted, or returns an existing result. A run that fails because of its own error
-    /// also has a result, which states the reason.
+    /// also has a result, which states the reason. Afterwards the result is in the directory of the run, also where it was a line of
+    /// `results.jsonl` before.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a cancel; [`Error::Busy`] while another process works on the run; temporary problems: a
     /// lost device, memory occupied by others, no device; errors of writing results.
     pub fn work(&self, study: &Study, run: &Run, observe: Observe<'_>) -> Result<Outcome> {
-        let Some(_alone) = Lock::take(&self.directory.join("locks").join(format!("run-{}", run.id)))? else {
+        let Some(_alone) = Lock::take(&self.results.directory.join("locks").join(format!("run-{}", run.id)))? else {
             return Err(Error::Busy(format!("another process is executing the run {}", run.id)));
         };
+        let directory = run_directory(self.results.directory, run);
         if let Some(outcome) = self.done(study, run)? {
+            if !directory.join(RESULT).exists() {
+                outcome.write(&directory)?;
+            }
             return Ok(outcome);
         }
-        let directory = run_directory(self.directory, run);
         let fingerprint = study.fingerprint(run)?;
         let mut outcome = Outcome::new(run, fingerprint);
         let gpu = (self.open)()?;
@@ -122,11 +122,12 @@ impl Workplace<'_> {
     }
 
     fn attempt(&self, gpu: &Gpu, study: &Study, run: &Run, resume: bool, observe: Observe<'_>) -> Result<RunScores> {
-        let directory = run_directory(self.directory, run);
+        let directory = run_directory(self.results.directory, run);
         let id = run.id.as_str();
-        let data = study.data[run.data].prepare(gpu, self.directory, run.seed, self.cancel, |what, done, of| {
-            observe(&StudyEvent::Making { run: id, what, done, of });
-        })?;
+        let data =
+            study.data[run.data].prepare(gpu, self.results.directory, run.seed, self.cancel, |what, done, of| {
+                observe(&StudyEvent::Making { run: id, what, done, of });
+            })?;
         let dataset = Dataset::open(&data)?;
         RunInfo { dataset: data.canonicalize().unwrap_or(data) }.write(&directory)?;
         let config = study.config(run);

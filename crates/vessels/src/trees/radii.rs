@@ -42,7 +42,7 @@ impl Lumen<'_> {
     /// Measures the radii along a centreline, mm.
     ///
     /// Where the vessels' attenuation is known, the area of a vessel is the field's integral across the centreline divided
-    /// by that attenuation, however blurred the field is; of all methods tried on phantoms (`docs/log/2026-11-performance.md`) this one
+    /// by that attenuation, however blurred the field is; of all methods tried on phantoms (`docs/tried.md`) this one
     /// has the smallest error. Otherwise the vessel ends at half of the local peak.
     pub(super) fn radii_mm(&self, points_mm: &[DVec3]) -> Vec<f64> {
         let radius = |(point, tangent): (&DVec3, DVec3)| self.radius_mm(*point, tangent) as f32;

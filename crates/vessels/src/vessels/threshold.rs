@@ -9,7 +9,7 @@ use crate::render::grid::PatientGrid;
 use crate::render::renderer::Renderer;
 
 /// Share of the vessels' stated attenuation from which a field counts as vessel. Fields are smoother than vessels, so one
-/// half would cut thin ones off, and one tenth would include noise. Among the shares tried (docs/log/2026-11-performance.md), one fifth
+/// half would cut thin ones off, and one tenth would include noise. Among the shares tried (docs/tried.md), one fifth
 /// is within 0.04 of the best Dice in all cases: both forms of dynamic field, phantoms and real anatomy, with and without
 /// noise.
 pub const VESSEL_SHARE: f64 = 0.2;
