@@ -15,11 +15,11 @@ pub mod pose;
 pub mod profiles;
 #[cfg(test)]
 mod samples;
+pub mod settings;
 mod sight;
 pub mod silhouettes;
 pub mod solve;
 
-use crate::config::{CalibrateMode, Config};
 use crate::error::{Error, Result};
 use crate::geometry::{MM_PER_UNIT, lps_mm_from_world};
 use crate::scan::canvas::corner;
@@ -31,6 +31,7 @@ use gauge::{FrameRays, RigidMotion, common_motion};
 use glam::DVec3;
 use observed::Observed;
 use pose::Poses;
+use settings::{CalibrateMode, CalibrateSettings};
 use solve::{ANGLE_DEG, BREATHING_MM, DEPTH_MM, IN_PLANE_MM};
 
 /// Corrections beyond this many standard deviations of the expected errors are rejected.
@@ -53,19 +54,19 @@ pub(crate) const MIN_CHANGE: f64 = 1e-5;
 /// Half side of the cube that represents the heart when corrections are compared, as a share of half the field of view.
 const HEART_SHARE: f64 = 0.5;
 
-/// Calibrates the training views of a dataset as the configuration asks.
+/// Calibrates the training views of a dataset as the settings ask.
 ///
 /// # Errors
 /// [`Error::Config`] when breathing is requested for a method that takes corrections per view only, such as a dynamic
 /// network.
-pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
-    let mode = config.calibrate.mode;
+pub fn calibrate(dataset: &Dataset, settings: CalibrateSettings) -> Result<Calibration> {
+    let CalibrateSettings { mode, follows_breath } = settings;
     if mode == CalibrateMode::Off {
         return Ok(Calibration::none(None));
     }
-    if mode == CalibrateMode::Breathing && !config.follows_breath() {
-        let problem = "networks, R2-Gaussian, X-Gaussian and SAX-NeRF support corrections per view only: choose \
-                       static, or other Gaussians as the dynamic field";
+    if mode == CalibrateMode::Breathing && !follows_breath {
+        let problem =
+            "the method of the preset supports corrections per view only: choose static, or the preset `fast`";
         return Err(Error::config("calibrate.mode", "breathing", problem));
     }
     let observed = Observed::new(dataset);
@@ -80,7 +81,7 @@ pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
              correction is accepted only if the views agree clearly better with it"
         ));
     }
-    let candidates = candidates(mode, config.follows_breath(), &mut notes);
+    let candidates = candidates(mode, follows_breath, &mut notes);
     Ok(Calibrator { dataset, observed: &observed, notes }.choose(&candidates))
 }
 

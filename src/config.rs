@@ -18,12 +18,14 @@ mod section;
 pub mod sections;
 mod x_gaussian;
 
+pub use crate::calibrate::settings::CalibrateMode;
+use crate::calibrate::settings::CalibrateSettings;
 use crate::choice::Choice;
 use crate::error::{Error, Result};
 use crate::files;
 pub use forms::{
-    AdjustMode, CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, R2Integral, R2Start,
-    StaticData, StaticForm,
+    AdjustMode, Decay, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, R2Integral, R2Start, StaticData,
+    StaticForm,
 };
 use method::MethodKind;
 use sections::{
@@ -231,6 +233,11 @@ impl Config {
     /// not.
     pub fn follows_breath(&self) -> bool {
         self.method() == MethodKind::DynamicGaussians
+    }
+
+    /// Returns the settings of the calibration before the fit.
+    pub fn calibration(&self) -> CalibrateSettings {
+        CalibrateSettings { mode: self.calibrate.mode, follows_breath: self.follows_breath() }
     }
 
     /// Checks that the method uses vessels that are known before; `field` and `value` tell where they come from.

@@ -93,7 +93,6 @@ pub use nertca_vk_gpu as gpu;
 pub use nertca_vk_formats as formats;
 pub use nertca_vk_formats::{files, raster};
 
-pub mod config;
 pub mod geometry;
 
 /// The compute stages.
@@ -164,6 +163,8 @@ pub mod evidence {
 
 pub mod calibrate;
 pub mod check;
+
+pub mod config;
 
 /// Gaussians, which several methods share: as data, in checkpoints, and on the device, where views see them.
 pub mod gaussians {

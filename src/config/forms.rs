@@ -108,21 +108,6 @@ pub enum R2Integral {
     Exact,
 }
 
-/// Corrections of the views' stated geometry.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
-#[serde(rename_all = "kebab-case")]
-#[strum(serialize_all = "kebab-case")]
-pub enum CalibrateMode {
-    /// The mode that best predicts phases left out of the calibration: none, static, or breathing.
-    Auto,
-    /// No correction.
-    Off,
-    /// Angles and position of each view, where this improves the agreement.
-    Static,
-    /// Angles and position of each view and a displacement of the heart in each frame, where this improves the agreement.
-    Breathing,
-}
-
 /// Adjustment of the calibrated geometry with the field in the loop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]

@@ -8,7 +8,8 @@ pub use crate::config::r2_gaussian::R2;
 pub use crate::config::sax_nerf::Sax;
 pub use crate::config::x_gaussian::X;
 
-use crate::config::forms::{AdjustMode, CalibrateMode};
+use crate::calibrate::settings::CalibrateMode;
+use crate::config::forms::AdjustMode;
 use crate::config::section::section;
 use serde::{Deserialize, Serialize};
 

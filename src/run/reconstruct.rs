@@ -188,7 +188,7 @@ fn calibrated(
     let calibration = if options.resume {
         Calibration::read(options.run)?.unwrap_or_else(|| Calibration::none(None))
     } else {
-        let mut calibration = calibrate(dataset, config)?;
+        let mut calibration = calibrate(dataset, config.calibration())?;
         let task = AdjustTask { gpu, config, dataset, calibration: &calibration };
         let mut shown = None;
         let mut observe = |share: f64| {

@@ -47,7 +47,7 @@ impl Shared {
         }
         let tuning = beside_pictures(gpu, tuning);
         dataset.notes.iter().for_each(|note| tracing::info!("{note}"));
-        let calibration = calibrate(&dataset, &config)?;
+        let calibration = calibrate(&dataset, config.calibration())?;
         calibration.notes.iter().for_each(|note| tracing::info!("{note}"));
         let dataset = dataset.corrected(&calibration)?;
         let fresh = Plan::new(&config, &dataset)?;

@@ -81,7 +81,7 @@ fn a_view_may_be_trained_and_scored() {
     phantom(&data, 4, &[&["--size", "80", "--breathing", "6"], &views[..]].concat());
     let stated = Dataset::open(&data).unwrap();
     assert_eq!(stated.views.len(), 5);
-    let calibration = calibrate(&stated, &Config::load(None, None, &[]).unwrap()).unwrap();
+    let calibration = calibrate(&stated, Config::load(None, None, &[]).unwrap().calibration()).unwrap();
     let corrected = stated.corrected(&calibration).unwrap();
     let motion = carried_by(&corrected).unwrap().expect("breathing carries the heart");
     let carried = in_calibrated_frame(&corrected).unwrap().expect("scored views do not breathe as trained ones do");

@@ -228,7 +228,7 @@ fn an_adjustment_brings_views_together() {
 fn views_that_agree_are_not_adjusted() {
     let gpu = gpu();
     let shot = Studio::new(&gpu, 100, 1).shoot(4, false, Wrong { seed: 11, ..Wrong::default() });
-    let calibration = calibrate(&shot.dataset, &fast()).unwrap();
+    let calibration = calibrate(&shot.dataset, fast().calibration()).unwrap();
     let (after, made) = adjust(&gpu, &shot, &calibration);
     let record = after.adjustment.clone().unwrap();
     println!("{record:?}");

@@ -32,7 +32,7 @@ fn error_px(shot: &Shot, dataset: &Dataset) -> f64 {
 /// Calibrates a shot, and returns the calibration and the remaining error, pixels.
 fn calibrated(shot: &Shot, mode: &str) -> (Calibration, f64) {
     let begin = Instant::now();
-    let calibration = calibrate(&shot.dataset, &config(mode)).unwrap();
+    let calibration = calibrate(&shot.dataset, config(mode).calibration()).unwrap();
     let seconds = begin.elapsed().as_secs_f64();
     let error = error_px(shot, &shot.dataset.corrected(&calibration).unwrap());
     let before = error_px(shot, &shot.dataset);
@@ -172,15 +172,15 @@ fn what_tells_nothing_is_left_as_stated() {
     one_view.frames.retain(|f| f.view == 0);
     for (dataset, why) in [(phases_alike, "all phases look the same"), (one_view, "at least two such views are needed")]
     {
-        let calibration = calibrate(&dataset, &config("auto")).unwrap();
+        let calibration = calibrate(&dataset, config("auto").calibration()).unwrap();
         assert_eq!(calibration.correction, Correction::Stated);
         assert!(calibration.notes.join(" ").contains(why), "{:?}", calibration.notes);
         assert_eq!(dataset.corrected(&calibration).unwrap().views[0].geometry, dataset.views[0].geometry);
     }
-    assert_eq!(calibrate(&small_dataset(40, 40), &config("off")).unwrap(), Calibration::none(None));
+    assert_eq!(calibrate(&small_dataset(40, 40), config("off").calibration()).unwrap(), Calibration::none(None));
     let network =
         Config::load(Some(nertca_vk::config::Preset::FastMlp), None, &["calibrate.mode=breathing".into()]).unwrap();
-    let refused = calibrate(&small_dataset(40, 40), &network).unwrap_err().to_string();
+    let refused = calibrate(&small_dataset(40, 40), network.calibration()).unwrap_err().to_string();
     assert!(refused.contains("calibrate.mode") && refused.contains("per view only"), "{refused}");
 }
 
@@ -252,7 +252,7 @@ fn a_session_tells_how_it_sees_its_frames() {
         assert!(away < 1e-9, "frame {index} as stated: {away} px");
     }
     session.train(1, &mut |_| true).unwrap();
-    let corrected = shot.dataset.corrected(&calibrate(&shot.dataset, &config("auto")).unwrap()).unwrap();
+    let corrected = shot.dataset.corrected(&calibrate(&shot.dataset, config("auto").calibration()).unwrap()).unwrap();
     for (index, f) in corrected.training().iter().enumerate() {
         let (correction, away) = farthest(index, &corrected.heart_rays(f));
         assert_eq!(correction, Correction::Breathing);

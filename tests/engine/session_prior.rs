@@ -30,7 +30,7 @@ fn a_session_fits_as_a_run_with_the_same_prior() {
         config.gaussians.fits = 1;
         let mut dataset = shot.dataset.clone();
         dataset.prior = Some(Arc::new(prior));
-        let dataset = dataset.corrected(&calibrate(&dataset, &config).unwrap()).unwrap();
+        let dataset = dataset.corrected(&calibrate(&dataset, config.calibration()).unwrap()).unwrap();
         let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
         run(&mut trainer, ITERATIONS);
         trainer.model().unwrap().gaussians.unwrap()

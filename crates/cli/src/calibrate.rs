@@ -5,7 +5,7 @@ use super::options::choice;
 use super::output::{CALIBRATION, KeptReferences, write_dataset};
 use clap::Args;
 use nertca_vk::calibrate::calibrate;
-use nertca_vk::config::{CalibrateMode, Config, Preset};
+use nertca_vk::calibrate::settings::{CalibrateMode, CalibrateSettings};
 use nertca_vk::error::Result;
 use nertca_vk::files;
 use nertca_vk::run::silhouette_pictures;
@@ -40,10 +40,10 @@ pub struct CalibrateArgs {
 pub fn run(args: &CalibrateArgs) -> Result<()> {
     let dataset = Dataset::open(&args.data)?;
     let references = KeptReferences::of(&dataset, args.keep_references)?;
-    let mut config = Config::preset(Preset::Fast);
-    config.calibrate.mode = args.mode;
+    // A dataset may be reconstructed with every preset, the default one included, whose field moves with each frame.
+    let settings = CalibrateSettings { mode: args.mode, follows_breath: true };
     let calibration = write_dataset(&args.out, args.force, |out| {
-        let calibration = calibrate(&dataset, &config)?;
+        let calibration = calibrate(&dataset, settings)?;
         let corrected = dataset.corrected(&calibration)?;
         let description = format!("calibrated from {}", dataset.path.display());
         let stated = |view| calibration.stated(view).cloned();

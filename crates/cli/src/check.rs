@@ -76,7 +76,7 @@ fn print(dataset: &Dataset, found: &Check) -> Result<()> {
     found.warnings.iter().for_each(|w| out!("warning: {w}"));
     if !found.faulty() {
         let config = Config::preset(Preset::Fast);
-        calibrate(dataset, &config)?.notes.iter().for_each(|note| out!("{note}"));
+        calibrate(dataset, config.calibration())?.notes.iter().for_each(|note| out!("{note}"));
         out!("{}", found.conclusion());
     }
     Ok(())
