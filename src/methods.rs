@@ -7,8 +7,7 @@ pub mod r2_gaussian;
 pub mod sax_nerf;
 pub mod x_gaussian;
 
-use crate::config::Config;
-use crate::config::method::MethodKind;
+use crate::config::{Config, Method as Settings};
 use crate::fitting::fit::Method;
 use dynamic_gaussians::DynamicGaussiansMethod;
 
@@ -24,12 +23,12 @@ pub static METHODS: &[&dyn Method] = &[
 
 /// Returns the method that a configuration chooses.
 pub fn of(config: &Config) -> &'static dyn Method {
-    match config.method() {
-        MethodKind::NertCa => &nert_ca::NertCa,
-        MethodKind::NerfCa => &nerf_ca::NerfCa,
-        MethodKind::DynamicGaussians => &DynamicGaussiansMethod,
-        MethodKind::R2Gaussian => &r2_gaussian::R2Gaussian,
-        MethodKind::XGaussian => &x_gaussian::XGaussian,
-        MethodKind::SaxNerf => &sax_nerf::SaxNerf,
+    match &config.method {
+        Settings::NertCa(_) => &nert_ca::NertCa,
+        Settings::NerfCa(_) => &nerf_ca::NerfCa,
+        Settings::DynamicGaussians(_) => &DynamicGaussiansMethod,
+        Settings::R2Gaussian(_) => &r2_gaussian::R2Gaussian,
+        Settings::XGaussian(_) => &x_gaussian::XGaussian,
+        Settings::SaxNerf(_) => &sax_nerf::SaxNerf,
     }
 }

@@ -4,8 +4,6 @@
 //! Projections do not show motion along a vessel; that part of the exported motion comes from the smoothness of the grid alone.
 //! So no strain is exported, and none should be derived.
 
-use crate::choice::Choice;
-use crate::config::GaussianForm;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::nrrd::{self, Encoding};
@@ -50,19 +48,13 @@ impl MotionFormat {
 /// [`Error::Config`] where the dynamic field is one set of Gaussians per phase or a network, because neither follows a point
 /// over time.
 pub fn deformable_set(model: &Model) -> Result<&DeformableGaussians> {
-    let form = model.gaussians.as_ref().map_or(GaussianForm::None, DynamicGaussians::form);
     model.gaussians.as_ref().and_then(DynamicGaussians::deformable).ok_or_else(|| {
-        let made_of = match form {
-            GaussianForm::None => "a network",
-            _ => "a set of Gaussians per phase",
-        };
+        let made_of = if model.gaussians.is_some() { "a set of Gaussians per phase" } else { "a network" };
         Error::config(
-            "gaussians.form",
-            form.name(),
-            format!(
-                "the dynamic field is {made_of}, which does not track points from phase to phase: train one deformable \
-                 set of Gaussians (preset fast with gaussians.form = \"deformable\")"
-            ),
+            "dynamic field",
+            made_of,
+            "it does not track points from phase to phase: train one deformable set of Gaussians (preset fast with \
+             gaussians.form = \"deformable\")",
         )
     })
 }

@@ -4,7 +4,6 @@
 use crate::calibrate::adjustment::Adjusted;
 use crate::calibrate::correction::Calibration;
 use crate::config::Config;
-use crate::config::method::MethodKind;
 use crate::error::{Error, Result};
 use crate::fitting::ledger::Ledger;
 use crate::fitting::losses::StepLoss;
@@ -26,9 +25,6 @@ use std::sync::Arc;
 
 /// A method of reconstruction with settings, data, stages and a field of its own.
 pub trait Method: Sync {
-    /// Returns the entry of the configuration that chooses this method.
-    fn kind(&self) -> MethodKind;
-
     /// Returns the name of the format of the method's checkpoints.
     fn checkpoint_format(&self) -> &'static str;
 

@@ -1,6 +1,5 @@
 //! Gaussians as the dynamic field, plain data: a set per phase, or one moving set.
 
-use crate::config::GaussianForm;
 use crate::error::{Error, Result};
 use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
@@ -8,9 +7,8 @@ use glam::DVec3;
 use serde::Serialize;
 use std::sync::{Arc, Mutex};
 
-/// Settings that make the steps of a fit smaller.
-pub const SMALLER_STEPS: &str = "lower learning rates in section `gaussians`: gaussians.position_rate, \
-                                 gaussians.scale_rate, gaussians.rotation_rate, gaussians.density_rate";
+/// Settings with which a fit of Gaussians that diverged may succeed.
+pub const SMALLER_STEPS: &str = "another seed, or a lower gaussians.count";
 
 /// Units of Gaussians, for conversion from and to world units and line integrals.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -194,13 +192,14 @@ impl DynamicGaussians {
         }
     }
 
-    /// Returns the form of the field: a set per phase as in X-Gaussian, in R2-Gaussian or in neither, or one moving set.
-    pub fn form(&self) -> GaussianForm {
+    /// Returns the name of the field's form: sets per phase that hide each other (`x`), that are crowded (`r2`) or neither (`phase`), or one
+    /// moving set (`deformable`).
+    pub fn form(&self) -> &'static str {
         match self {
-            DynamicGaussians::PerPhase(sets) if sets.intensities.is_some() => GaussianForm::X,
-            DynamicGaussians::PerPhase(sets) if sets.is_crowd => GaussianForm::R2,
-            DynamicGaussians::PerPhase(_) => GaussianForm::Phase,
-            DynamicGaussians::Deformable(_) => GaussianForm::Deformable,
+            DynamicGaussians::PerPhase(sets) if sets.intensities.is_some() => "x",
+            DynamicGaussians::PerPhase(sets) if sets.is_crowd => "r2",
+            DynamicGaussians::PerPhase(_) => "phase",
+            DynamicGaussians::Deformable(_) => "deformable",
         }
     }
 

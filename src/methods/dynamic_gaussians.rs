@@ -21,6 +21,7 @@ mod prior;
 mod pruning;
 pub mod remainder;
 mod repeated;
+pub mod rules;
 pub mod seeds;
 #[cfg(feature = "diagnostics")]
 pub mod selftest;
@@ -38,11 +39,9 @@ pub mod trainer;
 pub mod twin;
 mod unseen;
 
-use crate::config::method::MethodKind;
-use crate::config::sections::Deformable;
-use crate::config::{Config, GaussianForm};
-use crate::error::Result;
-use crate::fields::data::lower_rates;
+use crate::config::sections::GaussiansSettings;
+use crate::config::{Config, GaussianForm, Method as Settings, OfMethod};
+use crate::error::{Error, Result};
 use crate::fields::state;
 use crate::fitting::fit::{
     AdjustTask, AdjustedFit, Fit, FitData, FitStart, MemoryEstimate, Method, Observe, PlannedFit, SavedAt, SavedFit,
@@ -61,6 +60,7 @@ use crate::scan::dataset::Dataset;
 use crate::tensors::File;
 use data::GaussianData;
 use fit::GaussianFit;
+use rules::Rules;
 use stages::DeformableKernels;
 use std::any::Any;
 use trainer::GaussiansFit;
@@ -69,10 +69,6 @@ use trainer::GaussiansFit;
 pub struct DynamicGaussiansMethod;
 
 impl Method for DynamicGaussiansMethod {
-    fn kind(&self) -> MethodKind {
-        MethodKind::DynamicGaussians
-    }
-
     fn checkpoint_format(&self) -> &'static str {
         FORMAT
     }
@@ -87,25 +83,28 @@ impl Method for DynamicGaussiansMethod {
     }
 
     fn read(&self, sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
-        let mut saved = state::read(sections, config, at, file)?;
+        let settings = config.fields().ok_or_else(|| Error::Internal("the configuration has no fields".into()))?;
+        let mut saved = state::read(sections, &settings, at, file)?;
         saved.field.gaussians = Some(tensors::read_section(sections, file, at.n_phases)?);
         Ok(saved)
     }
 
     fn memory(&self, config: &Config, dataset: &Dataset, max_buffer: u64) -> Option<MemoryEstimate> {
         // Sets per phase are fitted with all pixels from the start.
-        (config.gaussians.form != GaussianForm::Phase).then(|| memory::estimate(dataset, max_buffer))
+        let form = GaussiansSettings::of(&config.method)?.gaussians.form;
+        (form != GaussianForm::Phase).then(|| memory::estimate(dataset, max_buffer))
     }
 
     fn rays_per_iteration(&self, config: &Config) -> u32 {
-        config.train.rays
+        config.fields().map_or(0, |settings| settings.rays)
     }
 
-    /// The run that is measured is that of the static field, after the minimum number of iterations of Gaussians.
+    /// The run that is measured is that of the static field, after an iteration of Gaussians, of which nothing else depends.
     fn lower_rates(&self, config: &mut Config, factor: f64) {
-        lower_rates(config, factor);
-        config.gaussians.iterations = 1;
-        config.deformable = Deformable { warm_iterations: 1, take: 0.0, track_iterations: 0, ..config.deformable };
+        let Settings::DynamicGaussians(own) = &mut config.method else { return };
+        own.static_field.lr_end *= factor;
+        own.static_field.lr = own.static_field.lr_end;
+        (own.gaussians.iterations, own.gaussians.form) = (1, GaussianForm::Phase);
     }
 
     fn smaller_steps(&self) -> &'static str {
@@ -114,7 +113,7 @@ impl Method for DynamicGaussiansMethod {
 
     fn make_pipelines(&self, gpu: &Gpu, config: &Config, tuning: &Tuning) -> Result<()> {
         GaussianKernels::new(gpu)?;
-        if config.gaussians.form != GaussianForm::Phase {
+        if config.of::<GaussiansSettings>()?.gaussians.form != GaussianForm::Phase {
             DeformableKernels::new(gpu)?;
         }
         BlobKernels::new(gpu, tuning)?;
@@ -132,7 +131,7 @@ impl FitData for GaussianData {
     }
 
     fn begin_timed(&self, start: &FitStart<'_>) -> Result<Box<dyn TimedFit>> {
-        Ok(Box::new(GaussianFit::new(start.gpu, self.targets.clone(), start.config)?))
+        Ok(Box::new(GaussianFit::new(start.gpu, self.targets.clone(), &Rules::of(&start.config.of()?))?))
     }
 
     fn hull(&self) -> Option<&Hull> {
@@ -140,7 +139,7 @@ impl FitData for GaussianData {
     }
 
     fn fits(&self, config: &Config) -> u32 {
-        self.targets.fits(config.gaussians.fits).0
+        GaussiansSettings::of(&config.method).map_or(1, |settings| self.targets.fits(settings.gaussians.fits).0)
     }
 
     fn set_scene(&mut self, scene: &Scene) {

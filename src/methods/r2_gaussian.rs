@@ -18,8 +18,8 @@ pub mod twin;
 pub mod twin_chords;
 pub(crate) mod twin_shape;
 
-use crate::config::method::MethodKind;
-use crate::config::{Config, StaticData};
+use crate::config::sections::R2Settings;
+use crate::config::{Config, Method as Settings, StaticData};
 use crate::error::Result;
 use crate::fields::scale::FieldVolume;
 use crate::fitting::extent::volume_half;
@@ -48,18 +48,15 @@ use trainer::R2Trainer;
 pub struct R2Gaussian;
 
 impl Method for R2Gaussian {
-    fn kind(&self) -> MethodKind {
-        MethodKind::R2Gaussian
-    }
-
     fn checkpoint_format(&self) -> &'static str {
         crate::gaussians::tensors::FORMAT
     }
 
     fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
+        let config = &config.of::<R2Settings>()?;
         let volume = FieldVolume { half: volume_half(config.r2.half_extent_mm, dataset), attenuation: None };
         let data = Box::new(data_of(config, dataset, notes)?);
-        Ok(PlannedFit { scene: Scene::of_volume(config, dataset, volume)?, data })
+        Ok(PlannedFit { scene: Scene::of_volume(dataset, volume), data })
     }
 
     fn read(&self, sections: &serde_json::Value, _: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
@@ -73,14 +70,10 @@ impl Method for R2Gaussian {
     }
 
     fn lower_rates(&self, config: &mut Config, factor: f64) {
-        config.r2.position_rate *= factor;
-        config.r2.position_rate_end *= factor;
-        config.r2.density_rate *= factor;
-        config.r2.density_rate_end *= factor;
-        config.r2.scale_rate *= factor;
-        config.r2.scale_rate_end *= factor;
-        config.r2.rotation_rate *= factor;
-        config.r2.rotation_rate_end *= factor;
+        let Settings::R2Gaussian(R2Settings { r2 }) = &mut config.method else { return };
+        for rate in [&mut r2.position_rate, &mut r2.density_rate, &mut r2.scale_rate, &mut r2.rotation_rate] {
+            *rate *= factor;
+        }
     }
 
     fn smaller_steps(&self) -> &'static str {
@@ -88,7 +81,7 @@ impl Method for R2Gaussian {
     }
 
     fn make_pipelines(&self, gpu: &Gpu, config: &Config, tuning: &Tuning) -> Result<()> {
-        R2Kernels::new(gpu, config.r2.integral)?;
+        R2Kernels::new(gpu, config.of::<R2Settings>()?.r2.integral)?;
         // A stage of other fits draws the pictures.
         Build::default().stage::<push::GaussianProject>(gpu)?;
         BlobKernels::new(gpu, tuning)?;
@@ -97,7 +90,7 @@ impl Method for R2Gaussian {
 }
 
 /// Prepares R2-Gaussian's data, and notes about them for the user.
-fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<R2Data> {
+fn data_of(config: &Config<R2Settings>, dataset: &Dataset, notes: &mut Vec<String>) -> Result<R2Data> {
     let half = volume_half(config.r2.half_extent_mm, dataset);
     let data = R2Data::new(dataset, &config.r2, half)?;
     let side_mm = 2.0 * half * MM_PER_UNIT;
@@ -124,7 +117,7 @@ fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
 
 impl FitData for R2Data {
     fn begin(&self, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<Box<dyn Fit>> {
-        let FitStart { gpu, config, .. } = *start;
+        let (gpu, config) = (start.gpu, &start.config.of()?);
         let own = |saved: &SavedFit| -> Option<(R2State, u32)> {
             let field = saved.field.gaussians.as_ref()?;
             Some((saved.state.as_any().downcast_ref::<R2State>()?.clone(), field.rows().step))

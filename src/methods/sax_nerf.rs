@@ -17,8 +17,8 @@ mod tensors;
 pub mod trainer;
 pub mod twin;
 
-use crate::config::method::MethodKind;
-use crate::config::{Config, StaticData};
+use crate::config::sections::SaxSettings;
+use crate::config::{Config, Method as Settings, OfMethod, StaticData};
 use crate::error::{Error, Result};
 use crate::fields::scale::FieldVolume;
 use crate::fitting::extent::volume_half;
@@ -41,38 +41,36 @@ use trainer::SaxTrainer;
 pub struct SaxNerf;
 
 impl Method for SaxNerf {
-    fn kind(&self) -> MethodKind {
-        MethodKind::SaxNerf
-    }
-
     fn checkpoint_format(&self) -> &'static str {
         "nertca-checkpoint-4"
     }
 
     fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
+        let config = &config.of::<SaxSettings>()?;
         let volume = FieldVolume {
             half: volume_half(config.sax.half_extent_mm, dataset),
             // Volumes are kept in units of the attenuation of a density of 1.
-            attenuation: Some(dataset.vessel_attenuation.filter(|_| config.sax.normalise).unwrap_or(1.0)),
+            attenuation: Some(dataset.vessel_attenuation.unwrap_or(1.0)),
         };
         let data = SaxData::new(dataset, &config.sax, volume.half)?;
         notes.extend(notes_of(config, dataset, &data));
-        Ok(PlannedFit { scene: Scene::of_volume(config, dataset, volume)?, data: Box::new(data) })
+        Ok(PlannedFit { scene: Scene::of_volume(dataset, volume), data: Box::new(data) })
     }
 
     fn read(&self, sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
         let bad = |e: serde_json::Error| Error::data(file.path, KEY, e.to_string());
         let about = serde_json::from_value(sections[KEY].clone()).map_err(bad)?;
-        let (field, state) = tensors::read(&about, SaxShape::of(&config.sax), file, at)?;
+        let (field, state) = tensors::read(&about, SaxShape::of(&config.of::<SaxSettings>()?.sax), file, at)?;
         Ok(SavedFit { field: FitField::of_own(Arc::new(field)), state: Arc::new(state) })
     }
 
     fn rays_per_iteration(&self, config: &Config) -> u32 {
-        setup::n_rays(&config.sax)
+        SaxSettings::of(&config.method).map_or(0, |settings| setup::n_rays(&settings.sax))
     }
 
     fn lower_rates(&self, config: &mut Config, factor: f64) {
-        config.sax.rate *= factor;
+        let Settings::SaxNerf(SaxSettings { sax }) = &mut config.method else { return };
+        sax.rate *= factor;
     }
 
     fn smaller_steps(&self) -> &'static str {
@@ -85,7 +83,7 @@ impl Method for SaxNerf {
 }
 
 /// Returns notes for the user about decisions on the data.
-fn notes_of(config: &Config, dataset: &Dataset, data: &SaxData) -> Vec<String> {
+fn notes_of(config: &Config<SaxSettings>, dataset: &Dataset, data: &SaxData) -> Vec<String> {
     let images = (0..data.n_sets()).map(|set| data.sets.images(set).len()).max().unwrap_or(1);
     let passes = config.train.iterations as usize / images;
     let mut notes = vec![match config.sax.static_data {
@@ -98,7 +96,7 @@ fn notes_of(config: &Config, dataset: &Dataset, data: &SaxData) -> Vec<String> {
              {passes} passes over them, is used for every phase (sax.static_data = \"pooled\")"
         ),
     }];
-    if config.sax.normalise && dataset.vessel_attenuation.is_none() {
+    if dataset.vessel_attenuation.is_none() {
         notes.push(
             "the dataset states no attenuation of vessels: densities are per 100 mm, and SAX-NeRF cannot represent \
              densities above 1"
@@ -111,7 +109,7 @@ fn notes_of(config: &Config, dataset: &Dataset, data: &SaxData) -> Vec<String> {
 
 impl FitData for SaxData {
     fn begin(&self, start: &FitStart<'_>, _: &mut Vec<String>) -> Result<Box<dyn Fit>> {
-        let FitStart { gpu, config, .. } = *start;
+        let (gpu, config) = (start.gpu, &start.config.of()?);
         let own = |saved: &SavedFit| -> Option<(SaxField, SaxState)> {
             let field = saved.field.own.as_ref()?.as_any().downcast_ref::<SaxField>()?;
             Some((field.clone(), saved.state.as_any().downcast_ref::<SaxState>()?.clone()))

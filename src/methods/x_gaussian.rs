@@ -14,8 +14,8 @@ mod tensors;
 pub mod trainer;
 pub mod twin;
 
-use crate::config::method::MethodKind;
-use crate::config::{Config, StaticData};
+use crate::config::sections::XSettings;
+use crate::config::{Config, Method as Settings, StaticData};
 use crate::error::Result;
 use crate::fields::scale::FieldVolume;
 use crate::fitting::extent::volume_half;
@@ -45,18 +45,15 @@ use trainer::XTrainer;
 pub struct XGaussian;
 
 impl Method for XGaussian {
-    fn kind(&self) -> MethodKind {
-        MethodKind::XGaussian
-    }
-
     fn checkpoint_format(&self) -> &'static str {
         crate::gaussians::tensors::FORMAT
     }
 
     fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
+        let config = &config.of::<XSettings>()?;
         let volume = FieldVolume { half: volume_half(config.x.half_extent_mm, dataset), attenuation: None };
         let data = Box::new(data_of(config, dataset, notes)?);
-        Ok(PlannedFit { scene: Scene::of_volume(config, dataset, volume)?, data })
+        Ok(PlannedFit { scene: Scene::of_volume(dataset, volume), data })
     }
 
     fn read(&self, sections: &serde_json::Value, _: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
@@ -70,12 +67,10 @@ impl Method for XGaussian {
     }
 
     fn lower_rates(&self, config: &mut Config, factor: f64) {
-        config.x.position_rate *= factor;
-        config.x.position_rate_end *= factor;
-        config.x.intensity_rate *= factor;
-        config.x.opacity_rate *= factor;
-        config.x.scale_rate *= factor;
-        config.x.rotation_rate *= factor;
+        let Settings::XGaussian(XSettings { x }) = &mut config.method else { return };
+        let positions = [&mut x.position_rate, &mut x.position_rate_end];
+        let others = [&mut x.intensity_rate, &mut x.opacity_rate, &mut x.scale_rate, &mut x.rotation_rate];
+        positions.into_iter().chain(others).for_each(|rate| *rate *= factor);
     }
 
     fn smaller_steps(&self) -> &'static str {
@@ -93,7 +88,7 @@ impl Method for XGaussian {
 }
 
 /// Prepares X-Gaussian's data, and notes about them for the user.
-fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<XData> {
+fn data_of(config: &Config<XSettings>, dataset: &Dataset, notes: &mut Vec<String>) -> Result<XData> {
     let half = volume_half(config.x.half_extent_mm, dataset);
     let data = XData::new(dataset, &config.x, half)?;
     let side_mm = 2.0 * half * MM_PER_UNIT;
@@ -121,7 +116,7 @@ fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
 
 impl FitData for XData {
     fn begin(&self, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<Box<dyn Fit>> {
-        let FitStart { gpu, config, .. } = *start;
+        let (gpu, config) = (start.gpu, &start.config.of()?);
         let own = |saved: &SavedFit| -> Option<(XState, u32)> {
             let field = saved.field.gaussians.as_ref()?;
             Some((saved.state.as_any().downcast_ref::<XState>()?.clone(), field.rows().step))

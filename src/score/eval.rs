@@ -305,8 +305,8 @@ pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Op
              check geometry and phases"
         }
         (true, true) => {
-            "Views may disagree by more than the motion hull allows: check geometry and phases, or try a smaller \
-             hull.dilate_pixels, a lower dynamic.lr or another seed"
+            "Views may disagree by more than the motion hull allows: check geometry and phases, or try a lower \
+             dynamic.lr or another seed"
         }
         (false, _) => {
             "Views may disagree by more than the motion hull allows: check geometry, phases and noise of the views"

@@ -52,7 +52,7 @@ pub fn model(gpu: &Gpu, dataset: &Dataset, field: DynamicGaussians, tuning: &Tun
     let config = Config::preset(Preset::Fast);
     let param_map = ParamMap::new(&config, dataset.n_phases as usize);
     Ok(Model {
-        params: param_map.initial(&config),
+        params: param_map.initial(config.seed),
         param_map,
         config,
         gaussians: Some(field),
@@ -112,7 +112,7 @@ pub fn compare_maxima(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Re
     findings.begin("r2", "600 Gaussians that overlap, view of 37 x 29 pixels");
     let (width, height) = (37, 29);
     let dataset = small_dataset(width, height, 3)?;
-    let config = r2::small_config(&[])?;
+    let config = r2::small_config(&[])?.into_any();
     let mut trainer = Trainer::new(gpu, Plan::new(&config, &dataset)?, &dataset, tuning.clone())?;
     let mut model = trainer.model()?;
     let overlapping = overlapping(&model)?;

@@ -1,6 +1,6 @@
 //! Runs that must come to the same bits when they are done again, however many iterations go into a submit.
 
-use crate::config::{Config, Preset, sections};
+use crate::config::Preset;
 use crate::error::Result;
 use crate::gaussians::particles::Particles;
 use crate::gpu::device::Gpu;
@@ -8,12 +8,13 @@ use crate::kernels::layout::Gaussian;
 use crate::kernels::tuning::Tuning;
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
+use crate::methods::dynamic_gaussians::rules::{GaussianRules, Rules};
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::Findings;
 use crate::selftest::iteration::path_name;
-use crate::selftest::problems::{deformable_case, hard_case, small_config, with_gaussians};
+use crate::selftest::problems::{default_rules, deformable_case, hard_case, small_config};
 use crate::train::trainer::Trainer;
 
 const REPEATS: &[&str] = &["equal runs have equal bits"];
@@ -75,8 +76,11 @@ fn losses(stops: &[u32], mut advance: impl FnMut(u32) -> Result<Vec<f64>>) -> Re
 /// Device errors.
 pub fn compare_gaussians(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     findings.begin("phase", "24 iterations, losses and Gaussians");
-    let settings = |config: Config| sections::Gaussians { iterations: ITERATIONS, grow_at: 0, ..config.gaussians };
-    let config = with_gaussians(settings(Config::preset(Preset::Fast)));
+    let short = |rules: Rules| {
+        let gaussians = GaussianRules { iterations: ITERATIONS, grow_at: 0, ..rules.gaussians };
+        Rules { gaussians, ..rules }
+    };
+    let config = short(default_rules()?);
     let (targets, rows) = hard_case()?;
     let run = |stops: &[u32]| -> Result<Vec<u64>> {
         let mut trainer = GaussianTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
@@ -86,7 +90,7 @@ pub fn compare_gaussians(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     };
     compare_runs(run, findings)?;
     let (targets, rows, config) = deformable_case()?;
-    let config = Config { gaussians: settings(config.clone()), ..config };
+    let config = short(config);
     findings.begin("deformable", "24 iterations, losses, Gaussians and their motion");
     compare_deformable(gpu, &targets, &rows, &config, findings)?;
     findings.begin("deformable", "the same with contrast that comes and goes, and fillings");
@@ -98,7 +102,7 @@ fn compare_deformable(
     gpu: &Gpu,
     targets: &Targets,
     rows: &[Gaussian],
-    config: &Config,
+    config: &Rules,
     findings: &mut Findings,
 ) -> Result<()> {
     let run = |stops: &[u32]| -> Result<Vec<u64>> {

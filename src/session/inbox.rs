@@ -1,6 +1,6 @@
 //! Frames of a session, as they came.
 
-use crate::config::{Config, DynamicTarget};
+use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT};
 use crate::scan::at_rest;
@@ -252,7 +252,7 @@ impl Inbox {
 
     /// Tells whether the dynamic field is found by what changes over the beat, so that a view needs two phases.
     fn is_temporal(&self) -> bool {
-        self.options.config.loss.dynamic_target == DynamicTarget::Temporal
+        self.options.config.is_temporal()
     }
 
     /// Returns the time in the beat of a moment, where that is known.
@@ -326,12 +326,8 @@ impl Inbox {
 
     /// Returns the configuration of training while frames may arrive.
     pub(super) fn training_config(&self) -> Config {
-        let mut config = self.options.config.clone();
-        if config.gaussians.fits == 0 {
-            // Pictures are wanted while frames arrive, and a mean of fits cannot go on with new ones.
-            config.gaussians.fits = 1;
-        }
-        config
+        // Pictures are wanted while frames arrive, and a mean of fits cannot go on with new ones.
+        self.options.config.fitted_once()
     }
 
     /// Returns the configuration of training after a fit to all frames has ended.

@@ -169,12 +169,12 @@ fn few_rooms_have_circles_inside() {
 
 /// Methods, and words that name each in code.
 const METHODS: [(&str, &[&str]); 6] = [
-    ("nert_ca", &["methods::nert_ca", "methodkind::nertca"]),
-    ("nerf_ca", &["methods::nerf_ca", "methodkind::nerfca"]),
-    ("dynamic_gaussians", &["methods::dynamic_gaussians", "methodkind::dynamicgaussians", "config.deformable"]),
-    ("r2_gaussian", &["methods::r2_gaussian", "methodkind::r2gaussian", "config.r2"]),
+    ("nert_ca", &["methods::nert_ca", "nertcasettings", "method::nertca"]),
+    ("nerf_ca", &["methods::nerf_ca", "nerfcasettings", "method::nerfca"]),
+    ("dynamic_gaussians", &["methods::dynamic_gaussians", "gaussianssettings", "method::dynamicgaussians"]),
+    ("r2_gaussian", &["methods::r2_gaussian", "r2settings", "method::r2gaussian", "config.r2"]),
     // Stages with an `x_` draw all Gaussians of which nearer ones hide those behind them.
-    ("x_gaussian", &["methods::x_gaussian", "methodkind::xgaussian", "config.x."]),
+    ("x_gaussian", &["methods::x_gaussian", "xsettings", "method::xgaussian", "config.x."]),
     ("sax_nerf", &["sax", "lineformer"]),
 ];
 
@@ -211,9 +211,24 @@ fn a_method_is_named_by_few_files_outside_its_room() {
             })
             .map(|(path, _)| path)
             .collect();
-        // A refusal for users, and the constants that the build makes from shaders.
-        let known: &[&str] = if method == "sax_nerf" { &["src/calibrate.rs", "src/kernels/constants.rs"] } else { &[] };
+        // The constants that the build makes from shaders.
+        let known: &[&str] = if method == "sax_nerf" { &["src/kernels/constants.rs"] } else { &[] };
         assert_eq!(outside, known, "{method}");
+    }
+}
+
+#[test]
+fn settings_of_a_method_name_no_other_method() {
+    for (method, _) in METHODS {
+        let own = format!("src/config/{method}.rs");
+        let uses = |line: &str| line.contains(&format!("::{method}")) || line.contains(&format!("mod {method};"));
+        let named: Vec<String> = files("src/config")
+            .into_iter()
+            .filter(|(path, text)| *path != own && code(text).any(uses))
+            .map(|(path, _)| path)
+            .filter(|path| !path.ends_with("/tests.rs"))
+            .collect();
+        assert!(named.is_empty(), "settings of {method} are named by {named:?}");
     }
 }
 

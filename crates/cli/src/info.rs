@@ -3,7 +3,6 @@
 use super::geometry_picture;
 use clap::Args;
 use nertca_vk::checkpoint::{self, Checkpoint};
-use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::{path_in_json, pretty_json};
 use nertca_vk::gaussians::field::DynamicGaussians;
@@ -87,7 +86,7 @@ fn describe_gaussians(field: &DynamicGaussians) -> serde_json::Value {
     let phases = 0..field.rows().n_phases;
     let filled = field.deformable().filter(|set| set.filling.is_some());
     serde_json::json!({
-        "form": field.form().name(),
+        "form": field.form(),
         "count": field.rows().rows.len(),
         "bytes": field.bytes(),
         "rest_phase": field.deformable().map(|set| set.setup.rest_phase),

@@ -125,7 +125,10 @@ impl Report<'_> {
                 model.step, model.config.train.iterations
             ));
         }
-        if model.config.hull.enabled && model.hull.is_none() && model.gaussians.is_none() {
+        if model.config.fields().is_some_and(|settings| settings.has_hull)
+            && model.hull.is_none()
+            && model.gaussians.is_none()
+        {
             warnings.push(
                 "No motion hull was used: the views may disagree, or there is motion in too much of the images."
                     .to_owned(),
@@ -133,8 +136,7 @@ impl Report<'_> {
         }
         if let Some(hull) = model.hull.as_ref().filter(|h| h.share() < 5e-5) {
             warnings.push(format!(
-                "The motion hull keeps only {:.4} % of the box, so the views hardly agree. Check geometry and phases, \
-                 or raise hull.dilate_pixels.",
+                "The motion hull keeps only {:.4} % of the box, so the views hardly agree. Check geometry and phases.",
                 100.0 * hull.share()
             ));
         }
@@ -186,8 +188,8 @@ fn gaussians_of(field: &DynamicGaussians) -> String {
         let percent = 100.0 * fits.overall;
         format!(", the mean of several fits; {percent:.0} % of the vessels of one fit lie in those of another")
     });
-    let (n, name) = (field.rows().rows.len(), field.form().name());
-    format!("{n}, {form} (gaussians.form = \"{name}\"), {kib:.0} KiB{agreement}")
+    let (n, name) = (field.rows().rows.len(), field.form());
+    format!("{n}, {form} (form \"{name}\"), {kib:.0} KiB{agreement}")
 }
 
 fn images_of(dataset: &Dataset) -> String {

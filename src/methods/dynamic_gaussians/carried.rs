@@ -1,11 +1,11 @@
 //! Goes on from a deformable set that was fitted before frames were added, or geometry stated anew, instead of beginning from seeds.
 
-use crate::config::Config;
 use crate::error::Result;
 use crate::gaussians::field::DeformableGaussians;
 use crate::gaussians::particles::Particles;
 use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::rules::Rules;
 use crate::methods::dynamic_gaussians::setup;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
@@ -29,7 +29,7 @@ impl Carried {
     ///
     /// # Errors
     /// As [`DeformableTrainer::with`].
-    pub(super) fn new(gpu: &Gpu, targets: Targets, config: &Config, earlier: &DeformableGaussians) -> Result<Carried> {
+    pub(super) fn new(gpu: &Gpu, targets: Targets, config: &Rules, earlier: &DeformableGaussians) -> Result<Carried> {
         let (was, phases_alike) = (&earlier.rest.setup, earlier.rest.n_phases == targets.n_phases);
         let rests_alike = earlier.setup.rest_phase as usize == targets.rest_phase;
         let has_room = setup::carried_step(&config.gaussians) < config.gaussian_iterations();

@@ -1,7 +1,7 @@
 //! Fit of the Gaussians in the form that configuration and data ask for.
 
 use crate::choice::Choice;
-use crate::config::{Config, GaussianForm};
+use crate::config::GaussianForm;
 use crate::error::{Error, Result};
 use crate::fitting::fit::{FitWork, TimedFit};
 use crate::gaussians::field::DynamicGaussians;
@@ -13,6 +13,7 @@ use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use crate::methods::dynamic_gaussians::fine::Fine;
 use crate::methods::dynamic_gaussians::made::Made;
 use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
+use crate::methods::dynamic_gaussians::rules::Rules;
 use crate::methods::dynamic_gaussians::start::DeformableStart;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
@@ -33,8 +34,8 @@ impl GaussianFit {
     ///
     /// # Errors
     /// As [`GaussianTrainer::new`] and [`DeformableStart::new`].
-    pub(crate) fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<GaussianFit> {
-        Ok(match targets.form(config.gaussians.form) {
+    pub(crate) fn new(gpu: &Gpu, targets: Targets, config: &Rules) -> Result<GaussianFit> {
+        Ok(match targets.form(config.form) {
             GaussianForm::Deformable => {
                 let (targets, fine) = Fine::split(gpu, targets, config);
                 GaussianFit::Start(Box::new(DeformableStart::new(gpu, targets, config)?), fine)
@@ -50,7 +51,7 @@ impl GaussianFit {
     pub(crate) fn reseeded(
         gpu: &Gpu,
         targets: Targets,
-        config: &Config,
+        config: &Rules,
         earlier: &DynamicGaussians,
     ) -> Result<GaussianFit> {
         let Some(earlier) = earlier.deformable().filter(|earlier| !earlier.rest.rows.is_empty()) else {
@@ -68,12 +69,10 @@ impl GaussianFit {
     pub(crate) fn after(
         gpu: &Gpu,
         mut targets: Targets,
-        config: &Config,
+        config: &Rules,
         earlier: &DynamicGaussians,
     ) -> Result<GaussianFit> {
-        if let (GaussianForm::Deformable, Some(deformable)) =
-            (targets.form(config.gaussians.form), earlier.deformable())
-        {
+        if let (GaussianForm::Deformable, Some(deformable)) = (targets.form(config.form), earlier.deformable()) {
             match Carried::new(gpu, targets, config, deformable)? {
                 Carried::On(fit) => return Ok(GaussianFit::Deformable(fit, None)),
                 Carried::Anew(same) => targets = *same,
@@ -182,7 +181,7 @@ impl GaussianFit {
         match self {
             GaussianFit::PerPhase(_) => GaussianForm::Phase,
             GaussianFit::Start(..) | GaussianFit::Deformable(..) => GaussianForm::Deformable,
-            GaussianFit::Made(fit) => fit.field().form(),
+            GaussianFit::Made(_) => GaussianForm::Deformable,
         }
     }
 

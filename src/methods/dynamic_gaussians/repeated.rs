@@ -1,12 +1,12 @@
 //! Several fits to the same images, whose mean is the dynamic field: each fit to noisy or inconsistent images has errors of its own.
 
-use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::fitting::fit::MadeGaussians;
 use crate::gaussians::field::DynamicGaussians;
 use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::fit::GaussianFit;
 use crate::methods::dynamic_gaussians::made::Made;
+use crate::methods::dynamic_gaussians::rules::Rules;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
 /// Difference of the seeds of one fit and the next.
@@ -54,7 +54,7 @@ pub(crate) struct Repeated {
     gpu: Gpu,
     /// Images of the other fits that are left; none for a single fit.
     targets: Option<Targets>,
-    config: Config,
+    config: Rules,
     fits: u32,
     /// Fit that is under way: the run's, one of the others, or the run's again, to report its iterations.
     fit: GaussianFit,
@@ -76,9 +76,9 @@ impl Repeated {
     ///
     /// # Errors
     /// As [`GaussianFit::new`].
-    pub(crate) fn new(gpu: &Gpu, targets: Targets, config: &Config, made: Option<&MadeGaussians>) -> Result<Repeated> {
+    pub(crate) fn new(gpu: &Gpu, targets: Targets, config: &Rules, made: Option<&MadeGaussians>) -> Result<Repeated> {
         let made = made.and_then(|made| Made::of(made, &targets, config));
-        let fits = targets.fits(config.gaussians.fits).0.max(1);
+        let fits = targets.fits(config.fits).0.max(1);
         let for_others = (fits > 1).then(|| targets.clone());
         let fit = match made {
             Some(made) => GaussianFit::Made(Box::new(made)),
@@ -88,7 +88,7 @@ impl Repeated {
     }
 
     /// Takes a single fit.
-    pub(crate) fn once(gpu: &Gpu, config: &Config, fit: GaussianFit) -> Repeated {
+    pub(crate) fn once(gpu: &Gpu, config: &Rules, fit: GaussianFit) -> Repeated {
         Repeated {
             gpu: gpu.clone(),
             targets: None,
@@ -176,7 +176,7 @@ impl Repeated {
         }
         let number = self.others.len() as u32 + 1;
         let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
-        let (targets, config) = (self.images(number)?, Config { seed, ..self.config.clone() });
+        let (targets, config) = (self.images(number)?, Rules { seed, ..self.config.clone() });
         let fit = GaussianFit::reseeded(&self.gpu, targets, &config, own.field())?;
         self.own = Some(own);
         Ok(fit)

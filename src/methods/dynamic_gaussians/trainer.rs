@@ -14,6 +14,7 @@ use crate::kernels::tuning::Tuning;
 use crate::methods::dynamic_gaussians::data::{GaussianData, Shot};
 use crate::methods::dynamic_gaussians::fit::GaussianFit;
 use crate::methods::dynamic_gaussians::repeated::Repeated;
+use crate::methods::dynamic_gaussians::rules::Rules;
 use std::any::Any;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -44,7 +45,7 @@ impl GaussiansFit {
     /// Errors of [`Repeated::new`] and [`FieldsFit::new`].
     pub(crate) fn new(data: GaussianData, start: &FitStart<'_>) -> Result<GaussiansFit> {
         let GaussianData { targets, fields, shots } = data;
-        let (gpu, config) = (start.gpu, start.config);
+        let (gpu, config) = (start.gpu, &Rules::of(&start.config.of()?));
         let resumed = start.from.resumed();
         let earlier = match start.from {
             Beginning::CarriedOn(saved) => saved.field.gaussians.as_ref(),
@@ -163,7 +164,7 @@ impl Fit for GaussiansFit {
         if self.gaussians.is_none() || self.fields.step() >= until {
             return self.fields.advance(until);
         }
-        let end = self.fields.data().config.gaussian_iterations();
+        let end = self.fields.data().settings.begin;
         let losses = self.advance_gaussians(until, end)?;
         if self.gaussians.is_none() {
             self.set_remaining_images()?;
@@ -187,7 +188,7 @@ impl Fit for GaussiansFit {
     }
 
     fn feed(&self) -> FieldFeed {
-        let params_fixed_until = self.fields.data().config.gaussian_iterations();
+        let params_fixed_until = self.fields.data().settings.begin;
         FieldFeed { params_fixed_until, gaussians: Some(self.feed.clone()), ..self.fields.feed() }
     }
 
