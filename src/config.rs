@@ -5,7 +5,7 @@
 //!
 //! This file is the registry of presets and methods: a method is added here and in a file of its own.
 
-pub mod choices;
+mod choices;
 mod common;
 mod configuration;
 mod dynamic_gaussians;

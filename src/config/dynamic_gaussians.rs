@@ -3,7 +3,9 @@
 use crate::calibrate::settings::CalibrateMode;
 use crate::config::choices::{AdjustMode, Decay, DynamicTarget, GaussianForm, OcclusionRegion};
 use crate::config::common::{Calibrate, Render, Train};
-use crate::config::fields::{Adam, DynamicField, FieldSettings, Loss, March, StaticField, Tensor, check_batches};
+use crate::config::fields::{
+    Adam, DynamicField, FieldSettings, Loss, March, Occupancy, StaticField, Tensor, check_batches,
+};
 use crate::config::method::MethodSettings;
 use crate::config::section::{section, sections};
 use crate::config::{Config, Preset, Shared};
@@ -175,12 +177,12 @@ impl MethodSettings for GaussiansSettings {
             march: March {
                 static_samples: self.march.static_samples,
                 dynamic_samples: 2,
-                render_samples: shared.render.render_samples,
                 per_ray_depths: true,
                 fit_dynamic_range: true,
                 fit_static_range: true,
-                along_axis: false,
             },
+            render_samples: shared.render.render_samples,
+            along_axis: false,
             static_field: StaticField::Tensor(self.static_field.clone()),
             network: None,
             dynamic: DynamicField {
@@ -197,7 +199,7 @@ impl MethodSettings for GaussiansSettings {
             },
             loss: Loss { normalise: true, dynamic_target: DynamicTarget::Temporal, robust: 0.1 },
             has_hull: true,
-            occupancy: None,
+            occupancy: Occupancy::NONE,
             adam: Adam { beta1: BETAS[0], beta2: BETAS[1], epsilon: EPSILON, decay_share: 1.0 },
             networks: None,
         })

@@ -94,6 +94,83 @@ section! {
     }
 }
 
+section! {
+    /// Sampling along rays.
+    March, "march" {
+        /// Depths per ray for the static field.
+        static_samples: u32 in 2.0 to 4096.0,
+        /// Depths per ray for the dynamic field.
+        dynamic_samples: u32 in 2.0 to 4096.0,
+    } fixed {
+        /// Draw depths for each ray instead of once per iteration.
+        per_ray_depths: bool,
+        /// Spread the dynamic field's depths over its own box instead of the whole depth range.
+        fit_dynamic_range: bool,
+        /// Spread the static field's depths over its own box instead of the whole depth range.
+        fit_static_range: bool,
+    }
+}
+
+section! {
+    /// Place and losses of the dynamic field.
+    DynamicField, "dynamic" {
+        /// Half side of its box, mm; 0 = the field of view.
+        half_extent_mm: f64 in 0.0 to 1e5,
+        /// Bands open when the field starts.
+        window_start: f64 in 0.0 to 16.0,
+        /// Iterations before the field starts. After the first iteration with it, moments and learning rates of both fields
+        /// start again.
+        delay: u32,
+        /// Weight of occlusion minimisation, lambda_o.
+        occlusion: f64 in 0.0 to 1e6,
+    } fixed {
+        /// Encode coordinates relative to the field's box instead of world units.
+        encode_box: bool,
+        /// Shift inside its softplus when the problem is normalised.
+        normalised_shift: f64 in -20.0 to 20.0,
+        /// With a temporal target, start at the best constant field instead.
+        best_start: bool,
+        /// Minimum slope of its softplus where a ray demands more attenuation, so that the gradient cannot vanish; 0 = none.
+        #[serde(alias = "least_slope")] min_slope: f64 in 0.0 to 1.0,
+        /// Share of the depth range, counted from the source, that occlusion minimisation covers, or the losses of two networks.
+        occlusion_share: f64 in 0.0 to 1.0,
+        /// Region of occlusion minimisation: "depth-range" (that share of the depth range) or "last-ray" (that
+        /// share of the path length of the batch's last ray).
+        #[serde(default)] occlusion_region: OcclusionRegion,
+    }
+}
+
+section! {
+    /// Loss terms.
+    Loss, "loss" {
+        /// Scale both fields and residuals by the data, so that numbers are near 1.
+        normalise: bool,
+        /// Data that the dynamic field is fitted to.
+        dynamic_target: DynamicTarget,
+    } fixed {
+        /// Residual of the dynamic field, as a share of strong temporal change, from which its loss grows linearly with a
+        /// temporal target, when the problem is normalised; 0 = squared throughout.
+        robust: f64 in 0.0 to 1e3,
+    }
+}
+
+section! {
+    /// Occupancy grid learned during training: where the dynamic field is empty, most samples are left out.
+    Occupancy, "occupancy" {} fixed {
+        /// Leave out samples where the field is empty.
+        enabled: bool,
+        /// Cells along each side of the dynamic field's box, for each phase.
+        cells: u32 in 2.0 to 256.0,
+        /// Iterations of the dynamic field before samples are left out.
+        start: u32 in 0.0 to 1e6,
+    }
+}
+
+impl Occupancy {
+    /// No grid: no samples are left out.
+    pub const NONE: Occupancy = Occupancy { enabled: false, cells: 0, start: 0 };
+}
+
 impl Network {
     /// Refuses shapes that no kernel computes.
     pub(super) fn check_shape(&self) -> Result<()> {
@@ -126,6 +203,10 @@ pub struct FieldSettings {
     pub motion_share: f64,
     /// Sampling along rays.
     pub march: March,
+    /// Depths per ray when rendering.
+    pub render_samples: u32,
+    /// Count path lengths along the source-detector axis, not along the ray.
+    pub along_axis: bool,
     /// The static field.
     pub static_field: StaticField,
     /// The network of the dynamic field; none where Gaussians are the dynamic field.
@@ -136,31 +217,12 @@ pub struct FieldSettings {
     pub loss: Loss,
     /// Whether a motion hull confines the dynamic field.
     pub has_hull: bool,
-    /// Occupancy grid learned during training; none where no samples are left out.
-    pub occupancy: Option<Occupancy>,
+    /// Occupancy grid learned during training.
+    pub occupancy: Occupancy,
     /// The optimiser.
     pub adam: Adam,
     /// Losses of two networks; none where the static field is no network.
     pub networks: Option<Networks>,
-}
-
-/// Sampling along rays.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct March {
-    /// Depths per ray for the static field.
-    pub static_samples: u32,
-    /// Depths per ray for the dynamic field.
-    pub dynamic_samples: u32,
-    /// Depths per ray when rendering.
-    pub render_samples: u32,
-    /// Draw depths for each ray instead of once per iteration.
-    pub per_ray_depths: bool,
-    /// Spread the dynamic field's depths over its own box instead of the whole depth range.
-    pub fit_dynamic_range: bool,
-    /// Spread the static field's depths over its own box instead of the whole depth range.
-    pub fit_static_range: bool,
-    /// Count path lengths along the source-detector axis, not along the ray.
-    pub along_axis: bool,
 }
 
 /// A static field.
@@ -201,53 +263,6 @@ impl StaticField {
     }
 }
 
-/// Place and losses of a dynamic field.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct DynamicField {
-    /// Half side of its box, mm; 0 = the field of view.
-    pub half_extent_mm: f64,
-    /// Encode coordinates relative to the field's box instead of world units.
-    pub encode_box: bool,
-    /// Bands open when the field starts.
-    pub window_start: f64,
-    /// Iterations before the field starts. After the first iteration with it, moments and learning rates of both fields start
-    /// again.
-    pub delay: u32,
-    /// Shift inside its softplus when the problem is normalised.
-    pub normalised_shift: f64,
-    /// With a temporal target, start at the best constant field instead.
-    pub best_start: bool,
-    /// Minimum slope of its softplus where a ray demands more attenuation, so that the gradient cannot vanish; 0 = none.
-    pub min_slope: f64,
-    /// Weight of occlusion minimisation, lambda_o.
-    pub occlusion: f64,
-    /// Share of the depth range, counted from the source, that occlusion minimisation covers, or the losses of two networks.
-    pub occlusion_share: f64,
-    /// Region of occlusion minimisation.
-    pub occlusion_region: OcclusionRegion,
-}
-
-/// Loss terms.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Loss {
-    /// Scale both fields and residuals by the data, so that numbers are near 1.
-    pub normalise: bool,
-    /// Data that the dynamic field is fitted to.
-    pub dynamic_target: DynamicTarget,
-    /// Residual of the dynamic field, as a share of strong temporal change, from which its loss grows linearly with a temporal
-    /// target, when the problem is normalised; 0 = squared throughout.
-    pub robust: f64,
-}
-
-/// Occupancy grid: where the dynamic field is empty, most samples are left out.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Occupancy {
-    /// Cells along each side of the dynamic field's box, for each phase.
-    pub cells: u32,
-    /// Iterations of the dynamic field before samples are left out.
-    pub start: u32,
-}
-
 /// Adam.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Adam {
@@ -267,7 +282,7 @@ pub struct Adam {
 /// [`Error::Config`] naming the key.
 pub(super) fn check_batches(settings: &FieldSettings) -> Result<()> {
     let (train, march) = (&settings.train, &settings.march);
-    if march.static_samples.max(march.dynamic_samples).max(march.render_samples) > train.chunk_samples {
+    if march.static_samples.max(march.dynamic_samples).max(settings.render_samples) > train.chunk_samples {
         return Err(Error::config(
             "train.chunk_samples",
             train.chunk_samples,

@@ -43,7 +43,9 @@ impl Config {
                 events.extend(fields.restart());
                 events.push(fields.dynamic.delay.saturating_add(network.window_iterations));
             }
-            events.extend(fields.occupancy.map(|o| fields.dynamic.delay.saturating_add(o.start)));
+            if fields.occupancy.enabled {
+                events.push(fields.dynamic.delay.saturating_add(fields.occupancy.start));
+            }
         }
         // The fit of the static field begins where that of the Gaussians ends.
         events.push(self.gaussian_iterations());

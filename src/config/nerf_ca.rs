@@ -4,7 +4,7 @@ use crate::calibrate::settings::CalibrateMode;
 use crate::config::choices::{Decay, DynamicTarget, OcclusionRegion};
 use crate::config::common::{Calibrate, Render, Train};
 use crate::config::fields::{
-    Adam, DynamicField, FieldSettings, Loss, March, Network, Networks, Rates, StaticField, check_batches,
+    Adam, DynamicField, FieldSettings, Loss, March, Network, Networks, Occupancy, Rates, StaticField, check_batches,
 };
 use crate::config::method::{MethodSettings, Scaled};
 use crate::config::section::{section, sections};
@@ -164,12 +164,12 @@ impl MethodSettings for NerfCaSettings {
             march: March {
                 static_samples: samples,
                 dynamic_samples: samples,
-                render_samples: shared.render.render_samples,
                 per_ray_depths: false,
                 fit_dynamic_range: false,
                 fit_static_range: false,
-                along_axis: self.march.along_axis,
             },
+            render_samples: shared.render.render_samples,
+            along_axis: self.march.along_axis,
             static_field: StaticField::Network(Rates {
                 start: self.static_field.lr,
                 end: self.static_field.lr_end,
@@ -190,7 +190,7 @@ impl MethodSettings for NerfCaSettings {
             },
             loss: Loss { normalise: false, dynamic_target: DynamicTarget::Absolute, robust: 0.0 },
             has_hull: false,
-            occupancy: None,
+            occupancy: Occupancy::NONE,
             adam: Adam { beta1: BETAS[0], beta2: BETAS[1], epsilon: self.adam.epsilon, decay_share: DECAY_SHARE },
             networks: Some(self.networks.clone()),
         })

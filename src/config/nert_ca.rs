@@ -26,66 +26,6 @@ section! {
 }
 
 section! {
-    /// Sampling along rays.
-    NertCaMarch, "march" {
-        /// Depths per ray for the static field.
-        static_samples: u32 in 2.0 to 4096.0,
-        /// Depths per ray for the dynamic field.
-        dynamic_samples: u32 in 2.0 to 4096.0,
-    } fixed {
-        /// Draw depths for each ray instead of once per iteration.
-        per_ray_depths: bool,
-        /// Spread the dynamic field's depths over its own box instead of the whole depth range.
-        fit_dynamic_range: bool,
-        /// Spread the static field's depths over its own box instead of the whole depth range.
-        fit_static_range: bool,
-    }
-}
-
-section! {
-    /// Place and losses of the dynamic field.
-    NertCaDynamic, "dynamic" {
-        /// Half side of its box, mm; 0 = the field of view.
-        half_extent_mm: f64 in 0.0 to 1e5,
-        /// Bands open when the field starts.
-        window_start: f64 in 0.0 to 16.0,
-        /// Iterations before the field starts. After the first iteration with it, moments and learning rates of both fields
-        /// start again.
-        delay: u32,
-        /// Weight of occlusion minimisation, lambda_o.
-        occlusion: f64 in 0.0 to 1e6,
-    } fixed {
-        /// Encode coordinates relative to the field's box instead of world units.
-        encode_box: bool,
-        /// Shift inside its softplus when the problem is normalised.
-        normalised_shift: f64 in -20.0 to 20.0,
-        /// With a temporal target, start at the best constant field instead.
-        best_start: bool,
-        /// Minimum slope of its softplus where a ray demands more attenuation, so that the gradient cannot vanish; 0 = none.
-        #[serde(alias = "least_slope")] min_slope: f64 in 0.0 to 1.0,
-        /// Share of the depth range, counted from the source, that occlusion minimisation covers.
-        occlusion_share: f64 in 0.0 to 1.0,
-        /// Region of occlusion minimisation: "depth-range" (that share of the depth range) or "last-ray" (that
-        /// share of the path length of the batch's last ray).
-        #[serde(default)] occlusion_region: OcclusionRegion,
-    }
-}
-
-section! {
-    /// Loss terms.
-    NertCaLoss, "loss" {
-        /// Scale both fields and residuals by the data, so that numbers are near 1.
-        normalise: bool,
-        /// Data that the dynamic field is fitted to.
-        dynamic_target: DynamicTarget,
-    } fixed {
-        /// Residual of the dynamic field, as a share of strong temporal change, from which its loss grows linearly with a
-        /// temporal target, when the problem is normalised; 0 = squared throughout.
-        robust: f64 in 0.0 to 1e3,
-    }
-}
-
-section! {
     /// Motion hull: where every view shows temporal change.
     NertCaHull, "hull" {
         /// Restrict the dynamic field to it.
@@ -105,18 +45,6 @@ section! {
 }
 
 section! {
-    /// Occupancy grid learned during training: where the dynamic field is empty, most samples are left out.
-    NertCaOccupancy, "occupancy" {} fixed {
-        /// Leave out samples where the field is empty.
-        enabled: bool,
-        /// Cells along each side of the dynamic field's box, for each phase.
-        cells: u32 in 2.0 to 256.0,
-        /// Iterations of the dynamic field before samples are left out.
-        start: u32 in 0.0 to 1e6,
-    }
-}
-
-section! {
     /// The optimiser.
     NertCaAdam, "adam" {} fixed {
         /// Constant added to the denominator.
@@ -130,19 +58,19 @@ sections! {
         /// Batches of rays.
         batch: NertCaRays,
         /// Sampling along rays.
-        march: NertCaMarch,
+        march: March,
         /// The static field.
         static_field: Tensor,
         /// The network of the dynamic field.
         network: Network,
         /// Place and losses of the dynamic field.
-        dynamic: NertCaDynamic,
+        dynamic: DynamicField,
         /// Loss terms.
-        loss: NertCaLoss,
+        loss: Loss,
         /// Motion hull.
         hull: NertCaHull,
         /// Occupancy grid.
-        occupancy: NertCaOccupancy,
+        occupancy: Occupancy,
         /// The optimiser.
         adam: NertCaAdam,
     }
@@ -165,7 +93,7 @@ pub(super) fn paper() -> Config<NertCaSettings> {
         render: Render { render_samples: 256 },
         method: NertCaSettings {
             batch: NertCaRays { rays: 2048, motion_share: 0.0 },
-            march: NertCaMarch {
+            march: March {
                 static_samples: 256,
                 dynamic_samples: 256,
                 per_ray_depths: true,
@@ -192,7 +120,7 @@ pub(super) fn paper() -> Config<NertCaSettings> {
                 lr_end: 1e-2,
                 decay: Decay::Linear,
             },
-            dynamic: NertCaDynamic {
+            dynamic: DynamicField {
                 half_extent_mm: 100.0,
                 window_start: 0.0,
                 delay: 1500,
@@ -204,7 +132,7 @@ pub(super) fn paper() -> Config<NertCaSettings> {
                 occlusion_share: 0.2,
                 occlusion_region: OcclusionRegion::DepthRange,
             },
-            loss: NertCaLoss { normalise: false, dynamic_target: DynamicTarget::Absolute, robust: 0.1 },
+            loss: Loss { normalise: false, dynamic_target: DynamicTarget::Absolute, robust: 0.1 },
             hull: NertCaHull {
                 enabled: false,
                 resolution: 128,
@@ -213,7 +141,7 @@ pub(super) fn paper() -> Config<NertCaSettings> {
                 dilate_pixels: 1,
                 max_share: 0.35,
             },
-            occupancy: NertCaOccupancy { enabled: false, cells: 64, start: 15_000 },
+            occupancy: Occupancy { enabled: false, cells: 64, start: 15_000 },
             adam: NertCaAdam { epsilon: 1e-8 },
         },
     }
@@ -244,7 +172,7 @@ pub(super) fn fast_mlp() -> Config<NertCaSettings> {
         render,
         method: NertCaSettings {
             batch: NertCaRays { rays: 1024, motion_share: 0.85 },
-            march: NertCaMarch {
+            march: March {
                 static_samples: 32,
                 dynamic_samples: 128,
                 per_ray_depths: true,
@@ -253,7 +181,7 @@ pub(super) fn fast_mlp() -> Config<NertCaSettings> {
             },
             static_field: Tensor { half_extent_mm: 0.0, tv: 1e-3, ..paper.static_field },
             network: Network { width: 96, bands: 8, window_iterations: 600, lr: 1e-2, lr_end: 3e-4, ..paper.network },
-            dynamic: NertCaDynamic {
+            dynamic: DynamicField {
                 half_extent_mm: 0.0,
                 window_start: 4.0,
                 delay: 0,
@@ -263,7 +191,7 @@ pub(super) fn fast_mlp() -> Config<NertCaSettings> {
                 min_slope: 1e-3,
                 ..paper.dynamic
             },
-            loss: NertCaLoss { normalise: true, dynamic_target: DynamicTarget::Temporal, ..paper.loss },
+            loss: Loss { normalise: true, dynamic_target: DynamicTarget::Temporal, ..paper.loss },
             hull: NertCaHull {
                 enabled: true,
                 resolution: 224,
@@ -272,7 +200,7 @@ pub(super) fn fast_mlp() -> Config<NertCaSettings> {
                 dilate_pixels: 0,
                 ..paper.hull
             },
-            occupancy: NertCaOccupancy { enabled: true, start: 256, ..paper.occupancy },
+            occupancy: Occupancy { enabled: true, start: 256, ..paper.occupancy },
             adam: paper.adam,
         },
     }
@@ -293,46 +221,21 @@ impl MethodSettings for NertCaSettings {
     }
 
     fn fields(&self, shared: &Shared<'_>) -> Option<FieldSettings> {
-        let (march, dynamic) = (&self.march, &self.dynamic);
         Some(FieldSettings {
             seed: shared.seed,
             train: shared.train.clone(),
             begin: 0,
             rays: self.batch.rays,
             motion_share: self.batch.motion_share,
-            march: March {
-                static_samples: march.static_samples,
-                dynamic_samples: march.dynamic_samples,
-                render_samples: shared.render.render_samples,
-                per_ray_depths: march.per_ray_depths,
-                fit_dynamic_range: march.fit_dynamic_range,
-                fit_static_range: march.fit_static_range,
-                along_axis: false,
-            },
+            march: self.march.clone(),
+            render_samples: shared.render.render_samples,
+            along_axis: false,
             static_field: StaticField::Tensor(self.static_field.clone()),
             network: Some(self.network.clone()),
-            dynamic: DynamicField {
-                half_extent_mm: dynamic.half_extent_mm,
-                encode_box: dynamic.encode_box,
-                window_start: dynamic.window_start,
-                delay: dynamic.delay,
-                normalised_shift: dynamic.normalised_shift,
-                best_start: dynamic.best_start,
-                min_slope: dynamic.min_slope,
-                occlusion: dynamic.occlusion,
-                occlusion_share: dynamic.occlusion_share,
-                occlusion_region: dynamic.occlusion_region,
-            },
-            loss: Loss {
-                normalise: self.loss.normalise,
-                dynamic_target: self.loss.dynamic_target,
-                robust: self.loss.robust,
-            },
+            dynamic: self.dynamic.clone(),
+            loss: self.loss.clone(),
             has_hull: self.hull.enabled,
-            occupancy: self
-                .occupancy
-                .enabled
-                .then_some(Occupancy { cells: self.occupancy.cells, start: self.occupancy.start }),
+            occupancy: self.occupancy.clone(),
             adam: Adam { beta1: BETAS[0], beta2: BETAS[1], epsilon: self.adam.epsilon, decay_share: 1.0 },
             networks: None,
         })

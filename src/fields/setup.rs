@@ -85,10 +85,12 @@ impl Scene {
 
     /// Sets when and where the dynamic field counts as empty.
     fn set_occupancy(&self, setup: &mut Setup, settings: &FieldSettings) {
-        let Some(occupancy) = &settings.occupancy else { return };
-        setup.occupancy_cells = occupancy.cells;
-        setup.occupancy_start = settings.dynamic.delay + occupancy.start;
-        setup.occupancy_threshold = (EMPTY * self.dynamic_gain) as f32;
+        let occupancy = &settings.occupancy;
+        if occupancy.enabled {
+            setup.occupancy_cells = occupancy.cells;
+            setup.occupancy_start = settings.dynamic.delay + occupancy.start;
+            setup.occupancy_threshold = (EMPTY * self.dynamic_gain) as f32;
+        }
     }
 }
 
@@ -107,8 +109,8 @@ fn choose_samples(setup: &mut Setup, settings: &FieldSettings) {
     setup.n_dynamic_samples = march.dynamic_samples;
     setup.jitter = 1;
     setup.per_ray_depths = u32::from(march.per_ray_depths);
-    setup.along_axis = u32::from(march.along_axis);
-    let max = settings.train.chunk_samples.max(march.dynamic_samples).max(march.render_samples);
+    setup.along_axis = u32::from(settings.along_axis);
+    let max = settings.train.chunk_samples.max(march.dynamic_samples).max(settings.render_samples);
     setup.sample_capacity = sample_capacity(max);
 }
 

@@ -19,7 +19,7 @@ pub(super) fn validation_step(config: &Config, dataset: &Dataset) -> usize {
     let unconfined = config.fields().filter(|settings| settings.network.is_some() && !settings.has_hull);
     let Some(settings) = unconfined.filter(|_| every > 0) else { return 1 };
     let images = dataset.validation().len().min(VALIDATION_IMAGES);
-    let validation = (images * dataset.n_pixels()) as f64 * f64::from(settings.march.render_samples);
+    let validation = (images * dataset.n_pixels()) as f64 * f64::from(settings.render_samples);
     let samples = f64::from(every) * f64::from(settings.rays) * f64::from(settings.march.dynamic_samples);
     let step = (validation / (LARGEST_SHARE * PASSES_OF_TRAINING * samples)).sqrt().ceil();
     let most = (dataset.width.min(dataset.height) / LEAST_SIDE).max(1);
