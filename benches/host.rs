@@ -22,9 +22,9 @@ use nertca_vk::train::trainer::Trainer;
 const SIDE: usize = 100;
 
 fn hull(c: &mut Criterion) {
-    let (dataset, config) = (small_dataset(SIDE, SIDE), Config::preset(Preset::FastMlp));
-    c.bench_function("motion_analysis", |b| b.iter(|| motion::analyse(&dataset, &config.hull)));
-    let moving = motion::analyse(&dataset, &config.hull);
+    let dataset = small_dataset(SIDE, SIDE);
+    c.bench_function("motion_analysis", |b| b.iter(|| motion::analyse(&dataset, motion::Thresholds::default())));
+    let moving = motion::analyse(&dataset, motion::Thresholds::default());
     c.bench_function("hull_carving", |b| b.iter(|| carve(&dataset, &moving, 0.6, 128, true)));
 }
 

@@ -29,9 +29,8 @@ impl<T: VariantArray + Into<&'static str> + Copy + Send + Sync> Choice for T {}
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{
-        CalibrateMode, DynamicForm, GaussianForm, OcclusionRegion, Preset, R2Integral, R2Start, StaticData, StaticForm,
-    };
+    use crate::calibrate::settings::CalibrateMode;
+    use crate::config::{GaussianForm, OcclusionRegion, Preset, R2Integral, R2Start, StaticData};
     use crate::export::volumes::Format;
     use crate::formats::raw::Element;
     use crate::kernels::tuning::Layers;
@@ -50,8 +49,6 @@ mod tests {
     #[test]
     fn names_are_those_in_files() {
         check_names_in_files::<Preset>();
-        check_names_in_files::<StaticForm>();
-        check_names_in_files::<DynamicForm>();
         check_names_in_files::<GaussianForm>();
         check_names_in_files::<OcclusionRegion>();
         check_names_in_files::<StaticData>();

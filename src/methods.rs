@@ -7,7 +7,7 @@ pub mod r2_gaussian;
 pub mod sax_nerf;
 pub mod x_gaussian;
 
-use crate::config::Config;
+use crate::config::{Config, Method as Settings};
 use crate::fitting::fit::Method;
 
 /// All methods.
@@ -22,6 +22,12 @@ pub static METHODS: [&Method; 6] = [
 
 /// Returns the method that a configuration chooses.
 pub fn of(config: &Config) -> &'static Method {
-    let [first, others @ ..] = METHODS;
-    others.into_iter().find(|method| method.kind == config.method()).unwrap_or(first)
+    match &config.method {
+        Settings::NertCa(_) => &nert_ca::METHOD,
+        Settings::NerfCa(_) => &nerf_ca::METHOD,
+        Settings::DynamicGaussians(_) => &dynamic_gaussians::METHOD,
+        Settings::R2Gaussian(_) => &r2_gaussian::METHOD,
+        Settings::XGaussian(_) => &x_gaussian::METHOD,
+        Settings::SaxNerf(_) => &sax_nerf::METHOD,
+    }
 }

@@ -1,8 +1,7 @@
 //! Runs of another length: schedules that keep their shares of the run, and the iterations at which they change something.
 
+use crate::config::Config;
 use crate::config::method::Scaled;
-use crate::config::{Config, GaussianForm};
-use crate::error::Result;
 
 /// Iterations of a dry run: enough for every event of the presets to have iterations before and after it.
 pub(super) const DRY_RUN: u32 = 20;
@@ -12,67 +11,44 @@ pub(super) const DRY_RUN_WITH_DENSIFYING: u32 = 60;
 const AFTER_THE_LAST: u32 = 4;
 
 impl Config {
-    /// Returns the settings, with their keys, that keep the schedule's shares of a run of so many iterations.
-    pub fn schedule_of_length(&self, iterations: u32) -> Vec<(&'static str, u32)> {
-        let scaled = Scaled(f64::from(iterations) / f64::from(self.train.iterations));
-        let mut schedule = vec![
-            ("dynamic.delay", scaled.count(self.dynamic.delay)),
-            ("dynamic.window_iterations", scaled.count(self.dynamic.window_iterations)),
-            ("occupancy.start", scaled.count(self.occupancy.start)),
-        ];
-        schedule.extend(self.method().settings().schedule(self, &scaled));
-        schedule
-    }
-
-    /// Returns this configuration for a run of so many iterations, with a schedule that keeps its shares.
-    ///
-    /// # Errors
-    /// [`crate::error::Error::Config`] when a run of that length is refused.
-    pub fn of_length(&self, iterations: u32) -> Result<Config> {
+    /// Returns this configuration for a run of so many iterations, with a schedule that keeps its shares; [`Config::check`] tells
+    /// whether it can be run.
+    pub fn of_length(&self, iterations: u32) -> Config {
         let mut config = self.clone();
+        let scaled = Scaled(f64::from(iterations) / f64::from(self.train.iterations));
+        config.method.settings_mut().scale(&scaled);
         config.train.iterations = iterations;
-        let schedule = self.schedule_of_length(iterations);
-        let settings: Vec<String> = schedule.iter().map(|(key, count)| format!("{key}={count}")).collect();
-        config.with_constants(&settings)
+        config
     }
 
     /// Returns the configuration of a dry run (`train::dry_run`): its schedule keeps its order, and its batches their sizes.
-    ///
-    /// # Errors
-    /// [`crate::error::Error::Config`] when so short a run is refused.
-    pub fn of_dry_run(&self) -> Result<Config> {
-        let method = self.method().settings();
-        let iterations = method.dry_run_length();
+    pub fn of_dry_run(&self) -> Config {
+        let iterations = self.method.settings().dry_run_length();
         if self.train.iterations <= iterations {
-            return Ok(self.clone());
+            return self.clone();
         }
-        let mut short = self.of_length(iterations)?;
-        if short.follows_breath() {
-            // A fit of Gaussians has its own number of iterations, which does not scale with the run.
-            short.train.iterations = short.gaussians.iterations.saturating_add(iterations).min(self.train.iterations);
-        }
-        method.shorten(&mut short, iterations);
+        let mut short = self.of_length(iterations);
+        short.method.settings_mut().shorten(&mut short.train, iterations, self.train.iterations);
         let last = short.schedule_events().last().copied().unwrap_or(0);
         short.train.iterations = short.train.iterations.max(last.saturating_add(AFTER_THE_LAST));
-        Ok(short)
+        short
     }
 
     /// Returns the iterations, in ascending order, at which the schedule changes something.
     pub fn schedule_events(&self) -> Vec<u32> {
-        let mut events = Vec::new();
-        if self.method().has_network() {
-            events.extend(self.restart().map(|restart| restart - 1));
-            events.extend(self.restart());
-            events.push(self.dynamic.delay.saturating_add(self.dynamic.window_iterations));
-        }
-        events.extend(self.method().settings().events(self));
-        if self.occupancy.enabled {
-            events.push(self.dynamic.delay.saturating_add(self.occupancy.start));
+        let mut events = self.method.settings().events();
+        if let Some(fields) = self.fields() {
+            if let Some(network) = &fields.network {
+                events.extend(fields.restart().map(|restart| restart - 1));
+                events.extend(fields.restart());
+                events.push(fields.dynamic.delay.saturating_add(network.window_iterations));
+            }
+            if fields.occupancy.enabled {
+                events.push(fields.dynamic.delay.saturating_add(fields.occupancy.start));
+            }
         }
         // The fit of the static field begins where that of the Gaussians ends.
-        if self.gaussians.form != GaussianForm::None {
-            events.push(self.gaussian_iterations());
-        }
+        events.push(self.gaussian_iterations());
         events.retain(|event| (1..self.train.iterations).contains(event));
         events.sort_unstable();
         events.dedup();
@@ -97,7 +73,7 @@ mod tests {
             (Preset::XGaussian, 400, vec![10, 20, 80, 160]),
             (Preset::SaxNerf, 9006, vec![9000]),
         ] {
-            let config = Config::preset(preset).of_length(length).unwrap();
+            let config = Config::preset(preset).of_length(length);
             assert_eq!((config.train.iterations, config.schedule_events()), (length, events), "{preset:?}");
         }
         assert_eq!(Config::preset(Preset::Fast).schedule_events(), [120]);

@@ -1,81 +1,56 @@
-//! Methods of reconstruction, as a configuration chooses them.
+//! What the settings of a method offer, and the declaration of the methods.
 
+use crate::config::Method;
+use crate::config::common::Train;
+use crate::config::configuration::Shared;
+use crate::config::fields::FieldSettings;
 use crate::config::length::DRY_RUN;
-use crate::config::{Config, Preset, dynamic_gaussians, nerf_ca, nert_ca, r2_gaussian, sax_nerf, x_gaussian};
+use crate::config::section::Sections;
 use crate::error::Result;
 
-/// A method of reconstruction. Each has settings of its own beside those that all methods share.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum MethodKind {
-    /// A static tensor field and a dynamic network, as in NerT-CA.
-    NertCa,
-    /// Two networks, as in NeRF-CA.
-    NerfCa,
-    /// Gaussians as the dynamic field in front of a static tensor field.
-    DynamicGaussians,
-    /// Static Gaussians with line integrals.
-    R2Gaussian,
-    /// Static Gaussians of which nearer ones hide those behind them.
-    XGaussian,
-    /// A hash grid and a Lineformer.
-    SaxNerf,
-}
-
-impl Config {
-    /// Returns the defaults of a preset.
-    pub fn preset(preset: Preset) -> Config {
-        match preset {
-            Preset::Fast => dynamic_gaussians::fast(),
-            Preset::FastMlp => nert_ca::fast_mlp(),
-            Preset::Paper => nert_ca::paper(),
-            Preset::PublicCode => nert_ca::public_code(),
-            Preset::NerfCa => nerf_ca::nerf_ca(),
-            Preset::R2Gaussian => r2_gaussian::r2_gaussian(),
-            Preset::XGaussian => x_gaussian::x_gaussian(),
-            Preset::SaxNerf => sax_nerf::sax_nerf(),
-        }
-    }
-}
-
 /// Share of a schedule's length that a run of another length has.
-pub(super) struct Scaled(pub(super) f64);
+pub(crate) struct Scaled(pub(super) f64);
 
 impl Scaled {
     /// Minimum number of iterations between two density controls of a shortened run: an iteration with density control learns
     /// nothing.
     const MIN_INTERVAL: u32 = 10;
 
-    /// Returns a number of iterations of the run of another length.
-    pub(super) fn count(&self, iterations: u32) -> u32 {
-        (self.0 * f64::from(iterations)).round() as u32
+    /// Changes a number of iterations to that of the run of another length.
+    pub(super) fn apply(&self, iterations: &mut u32) {
+        *iterations = (self.0 * f64::from(*iterations)).round() as u32;
     }
 
-    /// Returns the number of iterations between two density controls of the run of another length; 0 stays 0.
-    pub(super) fn interval(&self, iterations: u32) -> u32 {
-        if iterations == 0 { 0 } else { self.count(iterations).max(Self::MIN_INTERVAL) }
+    /// Changes the number of iterations between two density controls to that of the run of another length; 0 stays 0.
+    pub(super) fn apply_interval(&self, iterations: &mut u32) {
+        if *iterations != 0 {
+            self.apply(iterations);
+            *iterations = (*iterations).max(Self::MIN_INTERVAL);
+        }
     }
 }
 
-/// Settings of a method: the checks of their combinations, the keys, and the schedule.
-pub(super) trait MethodSettings {
+/// Settings of a method: the checks of their combinations, and the schedule.
+pub(crate) trait MethodSettings: Sections {
+    /// Returns the name of the method, for messages.
+    fn name(&self) -> &'static str;
+
     /// Refuses settings that the method does not support, or that contradict each other.
     ///
     /// # Errors
-    /// [`crate::error::Error::Config`] naming the key.
-    fn check(&self, _config: &Config) -> Result<()> {
-        Ok(())
+    /// [`Error::Config`] naming the key.
+    fn check(&self, shared: &Shared<'_>) -> Result<()>;
+
+    /// Returns the settings of fields that rays are marched through; none for a method without such fields.
+    fn fields(&self, _shared: &Shared<'_>) -> Option<FieldSettings> {
+        None
     }
 
-    /// Tells whether a setting, such as `static.lr`, is a key of a preset of this method.
-    fn is_key(&self, preset: Preset, key: &str) -> bool;
-
-    /// Returns the method's own settings, with their keys, that keep the schedule's shares of a run of another length.
-    fn schedule(&self, _config: &Config, _scaled: &Scaled) -> Vec<(&'static str, u32)> {
-        Vec::new()
-    }
+    /// Changes the schedule to that of a run of another length.
+    fn scale(&mut self, _scaled: &Scaled) {}
 
     /// Returns the iterations at which the method's own schedule changes something, in any order.
-    fn events(&self, _config: &Config) -> Vec<u32> {
+    fn events(&self) -> Vec<u32> {
         Vec::new()
     }
 
@@ -84,47 +59,86 @@ pub(super) trait MethodSettings {
         DRY_RUN
     }
 
-    /// Moves events that the schedule of a dry run of so many iterations would leave out.
-    fn shorten(&self, _config: &mut Config, _iterations: u32) {}
-}
+    /// Makes room for events that the schedule of a dry run of so many `iterations` would leave out; the run has `whole` iterations.
+    fn shorten(&mut self, _train: &mut Train, _iterations: u32, _whole: u32) {}
 
-impl MethodKind {
-    /// Returns the settings of the method.
-    pub(super) fn settings(self) -> &'static dyn MethodSettings {
-        match self {
-            MethodKind::NertCa => &nert_ca::Settings,
-            MethodKind::NerfCa => &nerf_ca::Settings,
-            MethodKind::DynamicGaussians => &dynamic_gaussians::Settings,
-            MethodKind::R2Gaussian => &r2_gaussian::Settings,
-            MethodKind::XGaussian => &x_gaussian::Settings,
-            MethodKind::SaxNerf => &sax_nerf::Settings,
-        }
+    /// Returns the number of iterations at the start of a run that fit Gaussians; the others fit a static field.
+    fn gaussian_iterations(&self, _train: &Train) -> u32 {
+        0
     }
 
-    /// Returns the name of the method, for messages.
-    pub fn name(self) -> &'static str {
-        match self {
-            MethodKind::NertCa => "a tensor field and a network",
-            MethodKind::NerfCa => "two networks (static.form = \"network\")",
-            MethodKind::DynamicGaussians => "Gaussians in front of a tensor field (gaussians.form)",
-            MethodKind::R2Gaussian => "R2-Gaussian",
-            MethodKind::XGaussian => "X-Gaussian",
-            MethodKind::SaxNerf => "SAX-NeRF",
-        }
+    /// Returns the number of iterations of a fit of Gaussians, to change it; none for a method without Gaussians.
+    fn gaussian_iterations_mut<'a>(&'a mut self, _train: &'a mut Train) -> Option<&'a mut u32> {
+        None
     }
 
-    /// Tells whether the method is fitted to whole images by itself, without a static field.
-    pub fn is_alone(self) -> bool {
-        matches!(self, MethodKind::R2Gaussian | MethodKind::XGaussian | MethodKind::SaxNerf)
-    }
+    /// Begins the network of the dynamic field after so many iterations.
+    fn delay_network(&mut self, _iterations: u32) {}
 
     /// Tells whether pictures of the dynamic field are blended, from about 0 to 1, so that they show no attenuation.
-    pub fn is_blended(self) -> bool {
-        self == MethodKind::XGaussian
+    fn is_blended(&self) -> bool {
+        false
     }
 
-    /// Tells whether the dynamic field is a network on encoded coordinates.
-    pub fn has_network(self) -> bool {
-        matches!(self, MethodKind::NertCa | MethodKind::NerfCa)
+    /// Tells whether the dynamic field supports a displacement of the heart in each frame, and vessels that are known before.
+    fn follows_breath(&self) -> bool {
+        false
     }
 }
+
+/// Settings of a method by which a configuration of that method is found.
+pub trait OfMethod: Clone {
+    /// Returns the settings if they are of this method.
+    fn of(method: &Method) -> Option<&Self>;
+}
+
+/// Declares the methods.
+macro_rules! methods {
+    ($($(#[$doc:meta])* $name:ident($settings:ident),)*) => {
+        /// A method of reconstruction with its settings.
+        #[derive(Debug, Clone, PartialEq)]
+        pub enum Method {
+            $($(#[$doc])* $name($settings),)*
+        }
+
+        impl Method {
+            pub(crate) fn settings(&self) -> &dyn $crate::config::method::MethodSettings {
+                match self {
+                    $(Method::$name(settings) => settings,)*
+                }
+            }
+
+            pub(crate) fn settings_mut(&mut self) -> &mut dyn $crate::config::method::MethodSettings {
+                match self {
+                    $(Method::$name(settings) => settings,)*
+                }
+            }
+
+            /// Reads the settings of the same method from a table.
+            pub(crate) fn read_alike(&self, table: &toml::Table) -> $crate::error::Result<Method> {
+                Ok(match self {
+                    $(Method::$name(_) => Method::$name($crate::config::section::Sections::read(table)?),)*
+                })
+            }
+        }
+
+        $(
+            impl From<$settings> for Method {
+                fn from(settings: $settings) -> Method {
+                    Method::$name(settings)
+                }
+            }
+
+            impl $crate::config::method::OfMethod for $settings {
+                fn of(method: &Method) -> Option<&$settings> {
+                    match method {
+                        Method::$name(settings) => Some(settings),
+                        _ => None,
+                    }
+                }
+            }
+        )*
+    };
+}
+
+pub(super) use methods;

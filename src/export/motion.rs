@@ -48,17 +48,13 @@ impl MotionFormat {
 /// [`Error::Config`] where the dynamic field is one set of Gaussians per phase or a network, because neither follows a point
 /// over time.
 pub fn moving_set(model: &Model) -> Result<&MovingGaussians> {
-    let field = model.gaussians.as_ref();
-    field.and_then(GaussianField::moving).ok_or_else(|| {
-        let (form, made_of) =
-            field.map_or(("none", "a network"), |field| (field.form(), "a set of Gaussians per phase"));
+    model.gaussians.as_ref().and_then(GaussianField::moving).ok_or_else(|| {
+        let made_of = if model.gaussians.is_some() { "a set of Gaussians per phase" } else { "a network" };
         Error::config(
-            "gaussians.form",
-            form,
-            format!(
-                "the dynamic field is {made_of}, which does not track points from phase to phase: train one deformable \
-                 set of Gaussians (preset fast with gaussians.form = \"deformable\")"
-            ),
+            "dynamic field",
+            made_of,
+            "it does not track points from phase to phase: train one deformable set of Gaussians (preset fast with \
+             gaussians.form = \"deformable\")",
         )
     })
 }

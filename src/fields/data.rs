@@ -1,7 +1,8 @@
 //! Data of a fit of fields, in the device's terms: scales, boxes, hull, backgrounds, ray lists, schedule. The device and its f64 twin
 //! start here.
 
-use crate::config::{Config, DynamicTarget};
+use crate::config::DynamicTarget;
+use crate::config::fields::FieldSettings;
 use crate::error::{Error, Result};
 use crate::fields::motion::ViewMotion;
 use crate::fields::start::StartRays;
@@ -16,8 +17,8 @@ use crate::scan::pixels::Pixels;
 /// Data of a fit of fields.
 #[derive(Clone)]
 pub struct FieldData {
-    /// Configuration of the run.
-    pub config: Config,
+    /// Settings of the fields.
+    pub settings: FieldSettings,
     /// Scales and boxes.
     pub scene: Scene,
     /// Constants for the shaders.
@@ -59,13 +60,13 @@ pub struct RayLists {
 
 impl RayLists {
     /// Lists the rays that meet a hull, if there is one, and all rays that are not hidden, if some are.
-    pub fn of_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], hull: Option<&Hull>) -> RayLists {
+    pub fn of_hull(dataset: &Dataset, motion: &[ViewMotion], hull: Option<&Hull>) -> RayLists {
         let (pixels, training) = (dataset.n_pixels(), dataset.training());
         let mut rays = Vec::new();
         if hull.is_some() {
             for (index, frame) in training.iter().enumerate() {
                 let Some(m) = motion.iter().find(|m| m.view == frame.view) else { continue };
-                let moving = if config.hull.per_phase { &m.moving_at[frame.phase as usize] } else { &m.moving };
+                let moving = &m.moving_at[frame.phase as usize];
                 let shown = (0..pixels).filter(|p| moving[*p] && dataset.shows(frame.view, *p));
                 rays.extend(shown.map(|p| (index * pixels + p) as u32));
             }
@@ -85,16 +86,17 @@ impl FieldData {
     /// # Errors
     /// [`Error::Unmet`] for a temporal target with a single phase.
     pub fn new(
-        config: &Config,
+        settings: &FieldSettings,
         dataset: &Dataset,
         motion: &[ViewMotion],
         hull: Option<Hull>,
         mut scene: Scene,
         lists: RayLists,
     ) -> Result<FieldData> {
-        let compared = config.method().has_network() && config.loss.dynamic_target == DynamicTarget::Temporal;
-        let rays = compared.then(|| StartRays::new(config, dataset, motion, hull.as_ref(), scene.dynamic_depth));
-        if let Some(rays) = rays.as_ref().filter(|_| config.loss.normalise && config.dynamic.best_start) {
+        let compared = settings.network.is_some() && settings.loss.dynamic_target == DynamicTarget::Temporal;
+        let rays = compared
+            .then(|| StartRays::new(settings.motion_share, dataset, motion, hull.as_ref(), scene.dynamic_depth));
+        if let Some(rays) = rays.as_ref().filter(|_| settings.loss.normalise && settings.dynamic.best_start) {
             scene.dynamic_shift = rays.best_shift(scene.dynamic_gain, scene.robust_scale);
         }
         let empty_loss = rays.map(|rays| scene.dynamic_weight * rays.empty_loss(scene.robust_scale));
@@ -104,25 +106,25 @@ impl FieldData {
             return Err(Error::unmet("loss.dynamic_target", "temporal", problem));
         }
         let (pixels, training) = (dataset.n_pixels(), dataset.training());
-        let params = ParamMap::new(config, dataset.n_phases as usize);
+        let params = ParamMap::of(Some(settings), dataset.n_phases as usize);
         let setup = Setup {
             n_motion_rays: match lists.n_motion {
                 0 => 0,
-                _ => (f64::from(config.train.rays) * config.train.motion_share).round() as u32,
+                _ => (f64::from(settings.rays) * settings.motion_share).round() as u32,
             },
             n_motion_list: lists.n_motion as u32,
             n_shown_list: (lists.rays.len() - lists.n_motion) as u32,
             n_all_rays: (training.len() * pixels) as u32,
             n_pixels: pixels as u32,
             image_width: dataset.width as u32,
-            ..scene.setup(config, &params, hull.as_ref())
+            ..scene.setup(settings, &params, hull.as_ref())
         };
         Ok(FieldData {
-            config: config.clone(),
+            settings: settings.clone(),
             scene,
             setup,
             params,
-            schedule: config.schedule_table(),
+            schedule: settings.schedule_table(),
             views: motion.iter().map(|m| layout::View::of(&dataset.views[m.view].rays)).collect(),
             frames: frames(dataset, motion),
             images: training.iter().map(|frame| frame.integrals.clone()).collect(),
@@ -167,13 +169,4 @@ pub fn heart_shifts_ignored(dataset: &Dataset) -> Option<String> {
         "the network uses one geometry for all frames of a view: the stated displacements of the heart are ignored"
             .into()
     })
-}
-
-/// Sets the learning rates of both fields to a share of their last ones, and opens all bands of the encoding.
-pub fn lower_rates(config: &mut Config, factor: f64) {
-    let (dynamic, static_field) = (&mut config.dynamic, &mut config.static_field);
-    dynamic.window_start = dynamic.bands.into();
-    dynamic.lr_end *= factor;
-    static_field.lr_end *= factor;
-    (dynamic.lr, static_field.lr) = (dynamic.lr_end, static_field.lr_end);
 }

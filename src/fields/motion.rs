@@ -1,7 +1,6 @@
 //! Motion in the angiograms, found without segmentation: each view's static background, its noise, and the motion hull, the set
 //! of points whose projection changes over time in every view that sees them.
 
-use crate::config;
 use crate::evidence::noise::{expected_minimum, noise_by_intensity};
 use crate::raster::{Image, dilate, median, opening, percentile};
 use crate::scan::canvas::{continued, framed};
@@ -58,10 +57,36 @@ impl ViewMotion {
     }
 }
 
+/// Standard deviations of noise by which the temporal range of a moving pixel exceeds what noise gives.
+const NOISE_SIGMAS: f32 = 6.0;
+/// Half width of the widest vessel, pixels: structures up to this width may be hidden in the static background.
+const VESSEL_PIXELS: usize = 3;
+/// Number of views below which views carve little.
+const MANY_VIEWS: usize = 4;
+
+/// Thresholds of motion.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Thresholds {
+    /// A pixel moves, with four views or more, when its range also exceeds this share of the strongest change in its view.
+    pub min_share: f64,
+    /// Threshold like `min_share` for fewer than four views: they carve less, so the threshold has to be higher.
+    pub min_share_few_views: f64,
+    /// Pixels by which moving regions grow.
+    pub dilate_pixels: u32,
+}
+
+impl Default for Thresholds {
+    /// Thresholds of the presets that are tuned: of a hull with which the default phantom is reconstructed best.
+    fn default() -> Thresholds {
+        Thresholds { min_share: 0.05, min_share_few_views: 0.08, dilate_pixels: 0 }
+    }
+}
+
 /// Analyses each training view.
-pub fn analyse(dataset: &Dataset, config: &config::sections::Hull) -> Vec<ViewMotion> {
+pub fn analyse(dataset: &Dataset, thresholds: Thresholds) -> Vec<ViewMotion> {
     let views = dataset.training_views();
-    let min_share = if views.len() < 4 { config.min_share_few_views } else { config.min_share } as f32;
+    let few = views.len() < MANY_VIEWS;
+    let min_share = if few { thresholds.min_share_few_views } else { thresholds.min_share } as f32;
     views
         .into_par_iter()
         .map(|view| {
@@ -87,18 +112,16 @@ pub fn analyse(dataset: &Dataset, config: &config::sections::Hull) -> Vec<ViewMo
             let background: Vec<f32> =
                 lowest.iter().zip(&noise).map(|(l, s)| if n > 1 { l + bias * s } else { *l }).collect();
             let image = |values: Vec<f32>| Image { width: size[0], height: size[1], values };
-            let vessel = config.vessel_pixels as usize;
-            let background_low = if vessel > 0 && n > 1 {
-                opening(&image(background.clone()), vessel).values
-            } else {
-                background.clone()
+            let background_low = match n > 1 {
+                true => opening(&image(background.clone()), VESSEL_PIXELS).values,
+                false => background.clone(),
             };
             let range: Vec<f32> = highest.iter().zip(&background).map(|(h, b)| (h - b).max(0.0)).collect();
             let strongest = percentile(&range, 0.995);
-            let threshold = |p: usize| (config.noise_sigmas as f32 * noise[p]).max(min_share * strongest);
+            let threshold = |p: usize| (NOISE_SIGMAS * noise[p]).max(min_share * strongest);
             let grow = |marked: &dyn Fn(usize) -> bool| -> Vec<bool> {
                 let marked = (0..pixels).map(|p| f32::from(u8::from(n > 1 && marked(p))));
-                let grown = dilate(&image(marked.collect()), config.dilate_pixels as usize);
+                let grown = dilate(&image(marked.collect()), thresholds.dilate_pixels as usize);
                 grown.values.iter().map(|v| *v > 0.0).collect()
             };
             let mut moving_at = vec![Vec::new(); dataset.n_phases as usize];

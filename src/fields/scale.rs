@@ -1,8 +1,9 @@
 //! Choosing scales and boxes for a dataset.
 
-use crate::config::{Config, DynamicTarget, StaticForm};
+use crate::config::DynamicTarget;
+use crate::config::fields::FieldSettings;
 use crate::error::{Error, Result};
-use crate::fields::motion::{ViewMotion, analyse};
+use crate::fields::motion::ViewMotion;
 use crate::fitting::extent::{box_half, field_of_view, seen_half};
 use crate::geometry::MM_PER_UNIT;
 use crate::model::hull::Hull;
@@ -25,17 +26,22 @@ impl Scene {
     ///
     /// # Errors
     /// [`Error::Data`] when the images cannot be normalised.
-    pub fn new(config: &Config, dataset: &Dataset, motion: &[ViewMotion], hull: Option<&Hull>) -> Result<Scene> {
+    pub fn new(
+        settings: &FieldSettings,
+        dataset: &Dataset,
+        motion: &[ViewMotion],
+        hull: Option<&Hull>,
+    ) -> Result<Scene> {
         let (near, far) = dataset.depth_range;
-        let static_half = static_half(config, dataset);
+        let static_half = static_half(settings, dataset);
         let static_reach = static_half * 3f64.sqrt();
-        let half = dynamic_half(config, dataset);
+        let half = dynamic_half(settings.dynamic.half_extent_mm, dataset);
         let (dynamic_min, dynamic_max) =
             hull.and_then(Hull::bounds).unwrap_or((DVec3::splat(-half), DVec3::splat(half)));
         let corner = dynamic_min.abs().max(dynamic_max.abs()).length();
         let dynamic_depth =
-            if config.march.fit_dynamic_range { [near.max(-corner), far.min(corner)] } else { [near, far] };
-        let (encode_centre, encode_scale) = if config.dynamic.encode_box {
+            if settings.march.fit_dynamic_range { [near.max(-corner), far.min(corner)] } else { [near, far] };
+        let (encode_centre, encode_scale) = if settings.dynamic.encode_box {
             let centre = 0.5 * (dynamic_min + dynamic_max);
             (centre, std::f64::consts::PI / (0.5 * (dynamic_max - dynamic_min)).max_element())
         } else {
@@ -44,16 +50,48 @@ impl Scene {
         let mut scene = Scene {
             static_min: [-static_half; 3],
             static_max: [static_half; 3],
-            dynamic_min: dynamic_min.to_array(),
-            dynamic_max: dynamic_max.to_array(),
-            static_depth: if config.march.fit_static_range {
+            static_depth: if settings.march.fit_static_range {
                 [near.max(-static_reach), far.min(static_reach)]
             } else {
                 [near, far]
             },
-            dynamic_depth,
             encode_centre: encode_centre.to_array(),
             encode_scale,
+            ..Scene::of_boxes(dynamic_min.to_array(), dynamic_max.to_array(), dynamic_depth, dataset)
+        };
+        if settings.loss.normalise {
+            scene.normalise(settings, dataset, motion, static_half)?;
+        }
+        if let Some(networks) = &settings.networks {
+            scene.hold_all_rays(networks.gain, dataset);
+        }
+        Ok(scene)
+    }
+
+    /// Returns scales and boxes of a static field that fills a volume by itself, and the region to look for vessels: the part of
+    /// the volume that the views see.
+    pub fn of_volume(dataset: &Dataset, volume: FieldVolume) -> Scene {
+        let (half, seen) = (volume.half, seen_half(dataset).min(volume.half));
+        let corner = half * 3f64.sqrt();
+        Scene {
+            static_gain: 0.0,
+            dynamic_gain: volume.attenuation.unwrap_or(1.0),
+            region: Some([[-seen; 3], [seen; 3]]),
+            ..Scene::of_boxes([-half; 3], [half; 3], [-corner, corner], dataset)
+        }
+    }
+
+    /// Returns a scene whose fields have the same box, from `min` to `max`, and the same depths, with scales of 1.
+    fn of_boxes(min: [f64; 3], max: [f64; 3], depth: [f64; 2], dataset: &Dataset) -> Scene {
+        Scene {
+            static_min: min,
+            static_max: max,
+            dynamic_min: min,
+            dynamic_max: max,
+            static_depth: depth,
+            dynamic_depth: depth,
+            encode_centre: [0.0; 3],
+            encode_scale: 1.0,
             static_gain: 1.0,
             static_shift: -10.0,
             dynamic_gain: 1.0,
@@ -63,53 +101,30 @@ impl Scene {
             robust_scale: 0.0,
             region: None,
             still: dataset.still,
-        };
-        if config.loss.normalise {
-            scene.normalise(config, dataset, motion, static_half)?;
         }
-        if config.static_field.form == StaticForm::Network {
-            scene.hold_all_rays(config, dataset);
-        }
-        Ok(scene)
-    }
-
-    /// Chooses scales and boxes for a field that fills a volume by itself.
-    ///
-    /// # Errors
-    /// Errors of [`Scene::new`].
-    pub fn of_volume(config: &Config, dataset: &Dataset, volume: FieldVolume) -> Result<Scene> {
-        let mut scene = Scene::new(config, dataset, &analyse(dataset, &config.hull), None)?;
-        scene.hold_volume(volume.half, seen_half(dataset));
-        scene.dynamic_gain = volume.attenuation.unwrap_or(scene.dynamic_gain);
-        Ok(scene)
-    }
-
-    /// Sets the boxes of a static method to its volume, of half side `half`, and the region to the part of it that the views
-    /// see, of half side `seen`. There is no static field.
-    fn hold_volume(&mut self, half: f64, seen: f64) {
-        (self.static_min, self.static_max) = ([-half; 3], [half; 3]);
-        (self.dynamic_min, self.dynamic_max) = ([-half; 3], [half; 3]);
-        let corner = half * 3f64.sqrt();
-        (self.static_depth, self.dynamic_depth) = ([-corner, corner], [-corner, corner]);
-        self.region = Some([[-seen.min(half); 3], [seen.min(half); 3]]);
-        self.static_gain = 0.0;
     }
 
     /// Sets the boxes of two networks, which hold every point of the views' rays however a C-arm turns them about the
     /// isocentre, so that new poses lose none either. Sets the networks' activations, too.
-    fn hold_all_rays(&mut self, config: &Config, dataset: &Dataset) {
+    fn hold_all_rays(&mut self, gain: f64, dataset: &Dataset) {
         let half = reach(dataset);
         (self.static_min, self.static_max) = ([-half; 3], [half; 3]);
         (self.dynamic_min, self.dynamic_max) = ([-half; 3], [half; 3]);
         // Most of that box is seen by one view or by none, and is no place to look for vessels.
         let seen = seen_half(dataset);
         self.region = Some([[-seen; 3], [seen; 3]]);
-        (self.static_gain, self.dynamic_gain) = (config.networks.gain, config.networks.gain);
+        (self.static_gain, self.dynamic_gain) = (gain, gain);
         (self.static_shift, self.dynamic_shift) = (0.0, 0.0);
     }
 
     /// Chooses gains, shifts and weights so that features, integrals and losses are near 1.
-    fn normalise(&mut self, config: &Config, dataset: &Dataset, motion: &[ViewMotion], static_half: f64) -> Result<()> {
+    fn normalise(
+        &mut self,
+        settings: &FieldSettings,
+        dataset: &Dataset,
+        motion: &[ViewMotion],
+        static_half: f64,
+    ) -> Result<()> {
         let training = dataset.training();
         let (mut count, mut sum) = (0, 0.0);
         for frame in training {
@@ -141,20 +156,20 @@ impl Scene {
         // A vessel fills a few percent of the field of view.
         let vessel = 0.05 * field_of_view(dataset);
         self.dynamic_gain = change / vessel;
-        (self.dynamic_weight, self.robust_scale) = match config.loss.dynamic_target {
-            DynamicTarget::Temporal => (1.0 / (change * change), config.loss.robust * change),
+        (self.dynamic_weight, self.robust_scale) = match settings.loss.dynamic_target {
+            DynamicTarget::Temporal => (1.0 / (change * change), settings.loss.robust * change),
             // Both fields share one squared residual.
             DynamicTarget::Absolute => (self.static_weight, 0.0),
         };
-        self.dynamic_shift = config.dynamic.normalised_shift;
+        self.dynamic_shift = settings.dynamic.normalised_shift;
         Ok(())
     }
 }
 
 /// Half side of the static field's box, world units. Points far outside the field of view are seen by one view at a time, and a
 /// box that held them would spend the field on them.
-fn static_half(config: &Config, dataset: &Dataset) -> f64 {
-    box_half(config.static_field.half_extent_mm, dataset)
+fn static_half(settings: &FieldSettings, dataset: &Dataset) -> f64 {
+    box_half(settings.static_field.tensor().map_or(0.0, |tensor| tensor.half_extent_mm), dataset)
 }
 
 /// Radius of the smallest ball around the isocentre that holds all rays of the views over the depth range, with a margin
@@ -174,18 +189,20 @@ fn reach(dataset: &Dataset) -> f64 {
     reach * (1.0 + 1e-5)
 }
 
-/// Half side of the box the dynamic field is searched in, world units.
-pub fn dynamic_half(config: &Config, dataset: &Dataset) -> f64 {
-    if config.dynamic.half_extent_mm > 0.0 { config.dynamic.half_extent_mm / MM_PER_UNIT } else { seen_half(dataset) }
+/// Half side of the box the dynamic field is searched in, world units; `half_extent_mm` is the setting, 0 = the field of view.
+pub fn dynamic_half(half_extent_mm: f64, dataset: &Dataset) -> f64 {
+    if half_extent_mm > 0.0 { half_extent_mm / MM_PER_UNIT } else { seen_half(dataset) }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Preset;
+    use crate::config::{Config, Preset};
+    use crate::fields::motion::{Thresholds, analyse};
     use crate::geometry::Geometry;
     use crate::model::component::Component;
     use crate::scan::dataset::{Frame, Layout, Split, View};
+    use crate::selftest::problems::with_values;
 
     const SIZE: usize = 8;
 
@@ -237,10 +254,9 @@ mod tests {
     }
 
     fn normalised(dataset: &Dataset, settings: &[&str]) -> Result<Scene> {
-        let settings: Vec<String> = ["loss.normalise=true"].iter().chain(settings).map(|s| (*s).to_owned()).collect();
-        let config = Config::preset(Preset::Paper).with_constants(&settings).unwrap();
-        let motion = crate::fields::motion::analyse(dataset, &config.hull);
-        Scene::new(&config, dataset, &motion, None)
+        let all = ["loss.normalise=true"].into_iter().chain(settings.iter().copied());
+        let settings = with_values(&Config::preset(Preset::Paper), all).unwrap().fields().unwrap();
+        Scene::new(&settings, dataset, &analyse(dataset, Thresholds::default()), None)
     }
 
     fn softplus(x: f64) -> f64 {
@@ -285,8 +301,8 @@ mod tests {
     #[test]
     fn boxes_of_two_networks_hold_every_ray_of_any_pose() {
         let data = dataset(2.0, 0.4);
-        let config = Config::preset(Preset::NerfCa);
-        let scene = Scene::new(&config, &data, &crate::fields::motion::analyse(&data, &config.hull), None).unwrap();
+        let settings = Config::preset(Preset::NerfCa).fields().unwrap();
+        let scene = Scene::new(&settings, &data, &analyse(&data, Thresholds::default()), None).unwrap();
         let half = scene.dynamic_max[0];
         let coordinate = |view: &View| corners(view).iter().fold(0f64, |m, x| m.max(x.abs().max_element()));
         let own = data.views.iter().map(coordinate).fold(0.0, f64::max);

@@ -1,9 +1,17 @@
 //! The schedules of a run as pure functions of the step.
 
-use crate::config::{Config, Decay, GaussianForm, StaticForm};
+use crate::config::fields::{FieldSettings, Rates};
+use crate::config::{Config, Decay};
 use crate::kernels::layout;
 
 impl Config {
+    /// Returns the schedule's row for iteration `step` (from 0); an empty one without fields that rays are marched through.
+    pub fn schedule(&self, step: u32) -> layout::Schedule {
+        self.fields().map_or_else(layout::Schedule::default, |settings| settings.schedule(step))
+    }
+}
+
+impl FieldSettings {
     /// Returns a row for every step and one more, so that the state after the last step has a row as well.
     pub fn schedule_table(&self) -> Vec<layout::Schedule> {
         (0..=self.train.iterations).map(|step| self.schedule(step)).collect()
@@ -12,13 +20,15 @@ impl Config {
     /// Returns the schedule's row for iteration `step` (from 0).
     pub fn schedule(&self, step: u32) -> layout::Schedule {
         let d = &self.dynamic;
-        let opened = f64::from(step.saturating_sub(d.delay)) / f64::from(d.window_iterations.max(1));
-        let bands = f64::from(d.bands);
+        let (bands, iterations) =
+            self.network.as_ref().map_or((0, 0), |network| (network.bands, network.window_iterations));
+        let opened = f64::from(step.saturating_sub(d.delay)) / f64::from(iterations.max(1));
+        let bands = f64::from(bands);
         layout::Schedule {
             static_update: self.static_update(step),
             dynamic_update: self.dynamic_update(step),
             window: (d.window_start + (bands - d.window_start) * opened).min(bands) as f32,
-            dynamic_active: u32::from(step >= d.delay && self.gaussians.form == GaussianForm::None),
+            dynamic_active: u32::from(step >= d.delay && self.network.is_some()),
             ..self.network_weights(step)
         }
     }
@@ -27,32 +37,30 @@ impl Config {
     /// field is there from the start. The authors' code makes its optimiser anew at the end of the first iteration with the dynamic
     /// field (`run_hybrid.py`, where `n_iter == model_delay`), not before it.
     pub(crate) fn restart(&self) -> Option<u32> {
-        (self.dynamic.delay > 0 && self.gaussians.form == GaussianForm::None)
-            .then(|| self.dynamic.delay.saturating_add(1))
+        (self.dynamic.delay > 0 && self.network.is_some()).then(|| self.dynamic.delay.saturating_add(1))
     }
 
     /// Returns Adam's update of the static field.
     fn static_update(&self, step: u32) -> layout::FieldUpdate {
-        let f = &self.static_field;
         // With Gaussians, the fit of the static field begins where that of the Gaussians ends.
         let begin = match self.restart() {
             Some(restart) if step >= restart => restart,
-            _ => self.gaussian_iterations(),
+            _ => self.begin,
         };
-        let rates = Rates { start: f.lr, end: f.lr_end, decay: f.decay };
-        self.update(rates.at(self.progress(f.decay, step)), step.saturating_sub(begin) + 1)
+        let rates = self.static_field.rates();
+        self.update(rates.at(self.progress(rates.decay, step)), step.saturating_sub(begin) + 1)
     }
 
     /// Returns Adam's update of the dynamic field. The update at the delay uses the optimiser that the static field has used so
     /// far, so that the next update is a first one again.
     fn dynamic_update(&self, step: u32) -> layout::FieldUpdate {
-        let d = &self.dynamic;
+        let Some(network) = &self.network else { return layout::FieldUpdate::default() };
         let (begin, progress) = match self.restart() {
             Some(restart) if step < restart => (restart - 1, 0.0),
-            Some(restart) => (restart, self.progress(d.decay, step)),
-            None => (0, self.progress(d.decay, step)),
+            Some(restart) => (restart, self.progress(network.decay, step)),
+            None => (0, self.progress(network.decay, step)),
         };
-        let rates = Rates { start: d.lr, end: d.lr_end, decay: d.decay };
+        let rates = Rates { start: network.lr, end: network.lr_end, decay: network.decay };
         self.update(rates.at(progress), step.saturating_sub(begin) + 1)
     }
 
@@ -83,10 +91,7 @@ impl Config {
 
     /// Returns the weights of the losses of two networks.
     fn network_weights(&self, step: u32) -> layout::Schedule {
-        let n = &self.networks;
-        if self.static_field.form != StaticForm::Network {
-            return layout::Schedule::default();
-        }
+        let Some(n) = &self.networks else { return layout::Schedule::default() };
         let after = |delay: u32, start: f64, end: f64| {
             if step < delay {
                 return 0.0;
@@ -102,14 +107,6 @@ impl Config {
             ..layout::Schedule::default()
         }
     }
-}
-
-/// Course of a learning rate from start to end.
-#[derive(Clone, Copy)]
-struct Rates {
-    start: f64,
-    end: f64,
-    decay: Decay,
 }
 
 impl Rates {
@@ -129,6 +126,10 @@ mod tests {
     use super::*;
     use crate::config::Preset;
 
+    fn fields(preset: Preset) -> FieldSettings {
+        Config::preset(preset).fields().unwrap()
+    }
+
     fn close(got: f32, want: f64) {
         assert!((f64::from(got) - want).abs() <= 1e-6 * want, "{got} {want}");
     }
@@ -137,7 +138,7 @@ mod tests {
     /// factor per iteration.
     #[test]
     fn the_delay_of_the_public_code_is_that_of_its_authors() {
-        let config = Config::preset(Preset::PublicCode);
+        let config = fields(Preset::PublicCode);
         let factor = 0.1f64.powf(1.0 / 30_000.0);
         let correction = |updates: i32| 1.0 - 0.99f64.powi(updates);
         for (step, restarts, static_powers, static_updates, dynamic_powers, dynamic_updates) in [
@@ -164,7 +165,7 @@ mod tests {
 
     #[test]
     fn paper_schedule_has_its_delay_window_and_restart_and_ends_where_the_paper_says() {
-        let config = Config::preset(Preset::Paper);
+        let config = fields(Preset::Paper);
         let (before, start, restart) = (config.schedule(1499), config.schedule(1500), config.schedule(1501));
         assert_eq!((before.dynamic_active, start.dynamic_active, start.window), (0, 1, 0.0));
         close(before.static_update.rate, 0.01 - 0.009 * 1499.0 / 30_000.0);
@@ -181,7 +182,7 @@ mod tests {
 
     #[test]
     fn nerf_ca_schedule_is_that_of_its_code() {
-        let config = Config::preset(Preset::NerfCa);
+        let config = fields(Preset::NerfCa);
         let [start, delayed, half, late] = [0, 40_000, 90_000, 160_000].map(|step| config.schedule(step));
         assert_eq!((start.window, start.dynamic_active, start.dynamic_update.restart), (1.0, 1, 1));
         assert_eq!((start.favour_static, start.near_integral), (0.0, 0.0));

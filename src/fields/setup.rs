@@ -1,34 +1,51 @@
 //! The constants that shaders read, computed from a model.
 
-use crate::config::{Config, DynamicTarget, OcclusionRegion, StaticForm};
+use crate::config::fields::FieldSettings;
+use crate::config::sections::Networks;
+use crate::config::{DynamicTarget, OcclusionRegion};
 use crate::fitting::{FIXED_POINT_BITS, RING_LENGTH};
 use crate::kernels::layout::Setup;
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
 use crate::model::scene::Scene;
 
+/// Share of static total variation that planes have: the weight of the paper's planes.
+const TV_PLANE: f64 = 1e-2;
+/// Share of static total variation that lines have: the weight of the paper's lines.
+const TV_LINE: f64 = 1e-3;
+/// Attenuation up to which a sample is empty, as a share of the dynamic field's scale: a typical vessel's when the problem is
+/// normalised, 0.01 per mm otherwise.
+const EMPTY: f64 = 0.01;
+
 impl Scene {
-    /// Returns the constants for the shaders; those of a training set (ray counts, image size) stay 0.
-    pub fn setup(&self, config: &Config, params: &ParamMap, hull: Option<&Hull>) -> Setup {
+    /// Returns the constants for the shaders of a fit and of its model; those of a training set (ray counts, image size) stay 0.
+    pub fn setup(&self, settings: &FieldSettings, params: &ParamMap, hull: Option<&Hull>) -> Setup {
         let mut setup = Setup {
-            seed: config.seed,
-            n_rays: config.train.rays,
+            seed: settings.seed,
+            n_rays: settings.rays,
             fixed_point_bits: FIXED_POINT_BITS,
             ring_length: RING_LENGTH,
-            ..Setup::default()
+            ..self.placed(params, hull)
         };
+        choose_samples(&mut setup, settings);
+        setup.n_bands = settings.network.as_ref().map_or(0, |network| network.bands);
+        self.weigh_losses(&mut setup, settings);
+        self.set_occupancy(&mut setup, settings);
+        set_optimiser(&mut setup, settings);
+        if let Some(networks) = &settings.networks {
+            set_networks(&mut setup, networks);
+        }
+        setup
+    }
+
+    /// Returns the constants of a model's boxes, depths, scales and shapes alone.
+    pub fn placed(&self, params: &ParamMap, hull: Option<&Hull>) -> Setup {
+        let mut setup = Setup::default();
         self.place_fields(&mut setup);
         if let Some(hull) = hull {
             place_hull(&mut setup, hull);
         }
-        choose_samples(&mut setup, config);
-        shape_fields(&mut setup, config, params);
-        self.weigh_losses(&mut setup, config);
-        self.set_occupancy(&mut setup, config);
-        set_optimiser(&mut setup, config);
-        if config.static_field.form == StaticForm::Network {
-            set_networks(&mut setup, config);
-        }
+        shape_fields(&mut setup, params);
         setup
     }
 
@@ -48,28 +65,32 @@ impl Scene {
     }
 
     /// Sets the weights of the objective.
-    fn weigh_losses(&self, setup: &mut Setup, config: &Config) {
+    fn weigh_losses(&self, setup: &mut Setup, settings: &FieldSettings) {
         let [near, far] = self.static_depth;
         setup.static_weight = self.static_weight as f32;
         setup.dynamic_weight = self.dynamic_weight as f32;
         setup.robust_scale = self.robust_scale as f32;
-        setup.min_slope = (config.dynamic.min_slope * self.dynamic_gain) as f32;
-        setup.temporal_target = u32::from(config.loss.dynamic_target == DynamicTarget::Temporal);
-        setup.occlusion_weight = config.dynamic.occlusion as f32;
-        setup.occlusion_depth = (near + (far - near) * config.dynamic.occlusion_share) as f32;
-        setup.occlusion_share = match config.dynamic.occlusion_region {
+        setup.min_slope = (settings.dynamic.min_slope * self.dynamic_gain) as f32;
+        setup.temporal_target = u32::from(settings.loss.dynamic_target == DynamicTarget::Temporal);
+        setup.occlusion_weight = settings.dynamic.occlusion as f32;
+        setup.occlusion_depth = (near + (far - near) * settings.dynamic.occlusion_share) as f32;
+        setup.occlusion_share = match settings.dynamic.occlusion_region {
             OcclusionRegion::DepthRange => 0.0,
-            OcclusionRegion::LastRay => config.dynamic.occlusion_share as f32,
+            OcclusionRegion::LastRay => settings.dynamic.occlusion_share as f32,
         };
-        setup.tv_plane = (config.static_field.tv * config.static_field.tv_plane) as f32;
-        setup.tv_line = (config.static_field.tv * config.static_field.tv_line) as f32;
+        let tv = settings.static_field.tensor().map_or(0.0, |tensor| tensor.tv);
+        setup.tv_plane = (tv * TV_PLANE) as f32;
+        setup.tv_line = (tv * TV_LINE) as f32;
     }
 
     /// Sets when and where the dynamic field counts as empty.
-    fn set_occupancy(&self, setup: &mut Setup, config: &Config) {
-        setup.occupancy_cells = if config.occupancy.enabled { config.occupancy.cells } else { 0 };
-        setup.occupancy_start = config.dynamic.delay + config.occupancy.start;
-        setup.occupancy_threshold = (config.occupancy.threshold * self.dynamic_gain) as f32;
+    fn set_occupancy(&self, setup: &mut Setup, settings: &FieldSettings) {
+        let occupancy = &settings.occupancy;
+        if occupancy.enabled {
+            setup.occupancy_cells = occupancy.cells;
+            setup.occupancy_start = settings.dynamic.delay + occupancy.start;
+            setup.occupancy_threshold = (EMPTY * self.dynamic_gain) as f32;
+        }
     }
 }
 
@@ -82,21 +103,20 @@ fn place_hull(setup: &mut Setup, hull: &Hull) {
 }
 
 /// Sets the numbers of samples of a ray and of a chunk.
-fn choose_samples(setup: &mut Setup, config: &Config) {
-    let march = &config.march;
+fn choose_samples(setup: &mut Setup, settings: &FieldSettings) {
+    let march = &settings.march;
     setup.n_static_samples = march.static_samples;
     setup.n_dynamic_samples = march.dynamic_samples;
     setup.jitter = 1;
     setup.per_ray_depths = u32::from(march.per_ray_depths);
-    setup.along_axis = u32::from(march.along_axis);
-    let max = config.train.chunk_samples.max(march.dynamic_samples).max(march.render_samples);
+    setup.along_axis = u32::from(settings.along_axis);
+    let max = settings.train.chunk_samples.max(march.dynamic_samples).max(settings.render_samples);
     setup.sample_capacity = sample_capacity(max);
 }
 
 /// Sets the sizes of planes, lines and network.
-fn shape_fields(setup: &mut Setup, config: &Config, params: &ParamMap) {
+fn shape_fields(setup: &mut Setup, params: &ParamMap) {
     setup.n_phases = params.phases as u32;
-    setup.n_bands = config.dynamic.bands;
     setup.grid = params.grid as u32;
     setup.rank4 = params.rank4 as u32;
     if let Some(network) = &params.dynamic_network {
@@ -119,10 +139,10 @@ fn set_networks(setup: &mut Setup, config: &Config) {
     setup.stop_below = networks.stop_below as f32;
 }
 
-fn set_optimiser(setup: &mut Setup, config: &Config) {
-    setup.beta1 = config.adam.beta1 as f32;
-    setup.beta2 = config.adam.beta2 as f32;
-    setup.epsilon = config.adam.epsilon as f32;
+fn set_optimiser(setup: &mut Setup, settings: &FieldSettings) {
+    setup.beta1 = settings.adam.beta1 as f32;
+    setup.beta2 = settings.adam.beta2 as f32;
+    setup.epsilon = settings.adam.epsilon as f32;
 }
 
 /// Returns the capacity, in samples, of a chunk for `samples`, which is also the stride between the features of a sample. Live

@@ -1,7 +1,6 @@
 //! Start of the network: the best constant field in the hull. If nearly every ray asks for a fainter field, the first steps
 //! push the network below the softplus, where no gradient brings it back (method, robustness of training).
 
-use crate::config::Config;
 use crate::fields::motion::ViewMotion;
 use crate::model::hull::Hull;
 use crate::scan::dataset::{Dataset, Frame};
@@ -35,7 +34,6 @@ pub struct StartRays(Vec<StartRay>);
 
 /// Inputs from which the rays are made.
 struct Source<'a> {
-    config: &'a Config,
     dataset: &'a Dataset,
     hull: Option<&'a Hull>,
     /// First and last depth along rays, world units.
@@ -45,10 +43,10 @@ struct Source<'a> {
 }
 
 impl StartRays {
-    /// Collects rays of a dataset's training images, by the motion in each view, as deep as the dynamic field reaches (`depth`,
+    /// Collects rays of a dataset's training images, by the motion in each view, a share of them from rays that meet the hull, as deep as the dynamic field reaches (`depth`,
     /// world units).
     pub fn new(
-        config: &Config,
+        motion_share: f64,
         dataset: &Dataset,
         motion: &[ViewMotion],
         hull: Option<&Hull>,
@@ -56,8 +54,8 @@ impl StartRays {
     ) -> StartRays {
         let of_view = |m| dataset.training().iter().filter(|f: &&Frame| f.view == m).collect::<Vec<_>>();
         let frames = motion.iter().flat_map(|m| of_view(m.view).into_iter().map(move |f| (f, m))).collect();
-        let source = Source { config, dataset, hull, depth, frames };
-        let share = if hull.is_some() { config.train.motion_share } else { 0.0 };
+        let source = Source { dataset, hull, depth, frames };
+        let share = if hull.is_some() { motion_share } else { 0.0 };
         let mut chosen = source.spread(share * RAYS, |index, p| source.moves(index, p));
         chosen.extend(source.spread((1.0 - share) * RAYS, |index, p| source.shows(index, p)));
         StartRays(chosen.into_par_iter().map(|(index, p)| source.ray(index, p)).collect())
@@ -82,7 +80,7 @@ impl Source<'_> {
 
     fn moves(&self, index: usize, pixel: usize) -> bool {
         let (frame, motion) = self.frames[index];
-        let seen = if self.config.hull.per_phase { &motion.moving_at[frame.phase as usize] } else { &motion.moving };
+        let seen = &motion.moving_at[frame.phase as usize];
         seen[pixel] && self.shows(index, pixel)
     }
 

@@ -1,6 +1,6 @@
 //! State of a fit of fields beside their parameters: as a checkpoint keeps it, on its way to the host, and as tensors of a file.
 
-use crate::config::{Config, StaticForm};
+use crate::config::fields::FieldSettings;
 use crate::error::{Error, Result};
 use crate::fitting::fit::{FitField, FitState, SavedAt, SavedFit, SavedState};
 use crate::gpu::buffer::Buffer;
@@ -113,14 +113,14 @@ impl FitState for FieldsState {
 ///
 /// # Errors
 /// [`Error::Data`] naming what is missing, misshapen or not finite.
-pub fn read(sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
+pub fn read(sections: &serde_json::Value, settings: &FieldSettings, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
     let bad = |field: &str, problem: String| Error::data(file.path, field, problem);
     let header: Sections = Deserialize::deserialize(sections).map_err(|e| bad("metadata", e.to_string()))?;
     if let Some(LossScale { scale, .. }) = header.loss_scale.filter(|s| !(s.scale.is_finite() && s.scale >= 1.0)) {
         return Err(bad("loss_scale", format!("is {scale} where at least 1 is needed")));
     }
-    check_size(config, at, file)?;
-    let map = ParamMap::new(config, at.n_phases);
+    check_size(settings, at, file)?;
+    let map = ParamMap::of(Some(settings), at.n_phases);
     let (mut params, mut moments) = (vec![0f32; map.len], vec![[0f32; 2]; map.len]);
     for tensor in map.tensors() {
         let shape: Vec<Option<usize>> = tensor.shape.iter().copied().map(Some).collect();
@@ -144,17 +144,14 @@ pub fn read(sections: &serde_json::Value, config: &Config, at: SavedAt, file: &F
 }
 
 /// Refuses a configuration that asks for more parameters than a file holds, before memory is reserved for them.
-fn check_size(config: &Config, at: SavedAt, file: &File<'_>) -> Result<()> {
-    let (s, d) = (&config.static_field, &config.dynamic);
-    let [grid, ranks, layers, width] = [s.grid, s.ranks, d.layers, d.width].map(u64::from);
-    let hidden = layers * width * width;
-    let static_len = match s.form {
-        StaticForm::Tensor => 3 * ranks * grid * (grid + 1),
-        StaticForm::Network => hidden,
-        StaticForm::None => 0,
-    };
-    let network = hidden + at.n_phases as u64 * u64::from(d.latent);
-    let needed = static_len + if config.method().has_network() { network } else { 0 };
+fn check_size(settings: &FieldSettings, at: SavedAt, file: &File<'_>) -> Result<()> {
+    let network = settings.network.as_ref().map_or(0, |n| u64::from(n.layers) * u64::from(n.width).pow(2));
+    let latents = settings.network.as_ref().map_or(0, |n| at.n_phases as u64 * u64::from(n.latent));
+    let static_len = settings.static_field.tensor().map_or(network, |tensor| {
+        let [grid, ranks] = [tensor.grid, tensor.ranks].map(u64::from);
+        3 * ranks * grid * (grid + 1)
+    });
+    let needed = static_len + network + latents;
     let bytes: usize = file.tensors.iter().map(|(_, tensor)| tensor.data().len()).sum();
     if needed > bytes as u64 / 4 {
         let problem = format!("{needed} parameters do not fit into the file's {bytes} bytes of tensors");

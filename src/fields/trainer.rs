@@ -102,7 +102,7 @@ fn upload_start(
 ) -> Result<DeviceState> {
     let mut now = DeviceState { loss_scale: network.map_or(1.0, Network::first_loss_scale), ..DeviceState::default() };
     let Some(SavedFields { params, state }) = saved else {
-        gpu.upload(&forward.params, 0, &data.params.initial(&data.config))?;
+        gpu.upload(&forward.params, 0, &data.params.initial(data.settings.seed))?;
         return Ok(now);
     };
     gpu.upload(&forward.params, 0, params)?;
@@ -174,9 +174,9 @@ impl FieldsFit {
         clear(gpu, networks, &forward, &training)?;
         let mut now = upload_start(gpu, &data, (&forward, &training), network.as_ref(), saved)?;
         // The static field's iterations follow those of Gaussians, which may have begun anew.
-        now.step = done.max(data.config.gaussian_iterations());
+        now.step = done.max(data.settings.begin);
         gpu.upload(&forward.state, 0, &[now])?;
-        let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(data.config.train.iterations_per_submit);
+        let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(data.settings.train.iterations_per_submit);
         Ok(FieldsFit {
             pace: SubmitPace::new(kernels.tuning.longest_submit_s, 1, per_submit).giving_way_to(gpu.looks()),
             gpu: gpu.clone(),
@@ -361,7 +361,7 @@ impl Iterates for FieldsFit {
             self.last_completion = Instant::now();
         }
         // Iterations change when the network starts: when those before it are done, the number per submit is tried anew.
-        let starts = self.data.config.dynamic.delay;
+        let starts = self.data.settings.dynamic.delay;
         loop {
             let is_starting = self.submitted == starts && self.completed < starts;
             if self.submitted >= until || is_starting || self.in_flight.len() >= self.submits_in_flight() {
@@ -450,7 +450,7 @@ impl FitData for FieldData {
             n_all_rays: self.setup.n_all_rays,
             n_pixels: self.setup.n_pixels,
             image_width: self.setup.image_width,
-            ..scene.setup(&self.config, &self.params, self.hull.as_ref())
+            ..scene.setup(&self.settings, &self.params, self.hull.as_ref())
         };
         self.scene = scene.clone();
     }

@@ -4,7 +4,6 @@
 use crate::calibrate::adjustment::Adjusted;
 use crate::calibrate::correction::Calibration;
 use crate::config::Config;
-use crate::config::method::MethodKind;
 use crate::error::{Error, Result};
 use crate::fitting::ledger::Ledger;
 use crate::fitting::losses::StepLoss;
@@ -26,8 +25,6 @@ use std::sync::Arc;
 
 /// A method of reconstruction, as the registry has it: what others must know of it, what each method does, and what only some can do.
 pub struct Method {
-    /// Entry of the configuration that chooses this method.
-    pub kind: MethodKind,
     /// Name of the format of the method's checkpoints.
     pub checkpoint_format: &'static str,
     /// Settings that make the method's steps smaller, as advice for a run that diverged.

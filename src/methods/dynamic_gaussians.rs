@@ -24,6 +24,7 @@ mod prior;
 mod pruning;
 pub mod remainder;
 mod repeated;
+pub mod rules;
 pub mod seeds;
 pub mod setup;
 pub mod shared_images;
@@ -38,11 +39,10 @@ mod test_targets;
 pub mod trainer;
 mod unseen;
 
-use crate::config::method::MethodKind;
-use crate::config::sections::Deformable;
-use crate::config::{Config, GaussianForm};
-use crate::error::Result;
-use crate::fields::{data as data_of_fields, state};
+use crate::config::sections::GaussiansSettings;
+use crate::config::{Config, GaussianForm, Method as Settings, OfMethod};
+use crate::error::{Error, Result};
+use crate::fields::state;
 use crate::fitting::fit::{
     Abilities, Fit, FitData, FitStart, Method, PlannedFit, RepeatFits, SavedAt, SavedFit, data_as,
 };
@@ -58,30 +58,31 @@ use crate::scan::dataset::Dataset;
 use crate::tensors::File;
 use data::GaussianData;
 use fit::GaussianFit;
+use rules::Rules;
 use stages::DeformableKernels;
 use trainer::GaussiansFit;
 
 /// The method, for the registry.
 pub static METHOD: Method = Method {
-    kind: MethodKind::DynamicGaussians,
     checkpoint_format: FORMAT,
     smaller_steps: AGAINST_DIVERGENCE,
     boxes_hold_all_rays: false,
     plan,
     read,
     make_pipelines,
-    rays_per_iteration: |config| config.train.rays,
+    rays_per_iteration: |config| config.fields().map_or(0, |settings| settings.rays),
     lower_rates,
     abilities: Abilities {
         adjust_views: Some(adjust::adjust),
         // Sets per phase are fitted with all pixels from the start.
         estimate_memory: Some(|config, dataset, max_buffer| {
-            (config.gaussians.form != GaussianForm::Phase).then(|| memory::estimate(dataset, max_buffer))
+            let form = GaussiansSettings::of(&config.method)?.gaussians.form;
+            (form != GaussianForm::Phase).then(|| memory::estimate(dataset, max_buffer))
         }),
         repeat_fits: Some(RepeatFits { count, only_one }),
         time_gaussians: Some(|data, start| {
             let targets = data_as::<GaussianData>(data)?.targets.clone();
-            Ok(Box::new(GaussianFit::new(start.gpu, targets, start.config, None)?))
+            Ok(Box::new(GaussianFit::new(start.gpu, targets, &Rules::of(&start.config.of()?), None)?))
         }),
     },
 };
@@ -95,7 +96,8 @@ fn plan(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<P
 
 /// Reads the fields and the state of their fit from a checkpoint.
 fn read(sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
-    let mut saved = state::read(sections, config, at, file)?;
+    let settings = config.fields().ok_or_else(|| Error::Internal("the configuration has no fields".into()))?;
+    let mut saved = state::read(sections, &settings, at, file)?;
     saved.field.gaussians = Some(tensors::read_section(sections, file, at.n_phases)?);
     Ok(saved)
 }
@@ -103,30 +105,33 @@ fn read(sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<
 /// Builds the pipelines of fits.
 fn make_pipelines(gpu: &Gpu, config: &Config, tuning: &Tuning) -> Result<()> {
     GaussianKernels::new(gpu)?;
-    if config.gaussians.form != GaussianForm::Phase {
+    if config.of::<GaussiansSettings>()?.gaussians.form != GaussianForm::Phase {
         DeformableKernels::new(gpu)?;
     }
     BlobKernels::new(gpu, tuning)?;
     into_buffers(gpu).map(|_| ())
 }
 
-/// Lowers the learning rates by a factor. The run that is measured is that of the static field, after the minimum number of iterations of
-/// Gaussians.
+/// Lowers the learning rates by a factor. The run that is measured is that of the static field, after an iteration of Gaussians, of which
+/// nothing else depends.
 fn lower_rates(config: &mut Config, factor: f64) {
-    data_of_fields::lower_rates(config, factor);
-    config.gaussians.iterations = 1;
-    config.deformable = Deformable { warm_iterations: 1, take: 0.0, track_iterations: 0, ..config.deformable };
+    let Settings::DynamicGaussians(own) = &mut config.method else { return };
+    own.static_field.lr_end *= factor;
+    own.static_field.lr = own.static_field.lr_end;
+    (own.gaussians.iterations, own.gaussians.form) = (1, GaussianForm::Phase);
 }
 
 /// Returns the number of fits to the images of these data.
 fn count(data: &dyn FitData, config: &Config) -> u32 {
-    data_as::<GaussianData>(data).map_or(1, |data| data.targets.fits(config.gaussians.fits).0)
+    let fits = GaussiansSettings::of(&config.method).map(|settings| settings.gaussians.fits);
+    fits.and_then(|fits| Some(data_as::<GaussianData>(data).ok()?.targets.fits(fits).0)).unwrap_or(1)
 }
 
 /// Changes settings that leave the number of fits to the data, so that there is a single one.
 fn only_one(config: &mut Config) {
-    if config.gaussians.fits == 0 {
-        config.gaussians.fits = 1;
+    let Settings::DynamicGaussians(own) = &mut config.method else { return };
+    if own.gaussians.fits == 0 {
+        own.gaussians.fits = 1;
     }
 }
 

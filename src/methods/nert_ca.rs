@@ -3,12 +3,13 @@
 //!
 //! The fit itself is that of [`crate::fields`]; here stand the choices that make it NerT-CA's.
 
-use crate::config::Config;
-use crate::config::method::MethodKind;
-use crate::error::Result;
+use crate::config::fields::FieldSettings;
+use crate::config::sections::{NertCaHull, NertCaSettings};
+use crate::config::{Config, Method as Settings};
+use crate::error::{Error, Result};
 use crate::fields::carve::carve;
-use crate::fields::data::{self, FieldData, RayLists, heart_shifts_ignored};
-use crate::fields::motion::{self, ViewMotion};
+use crate::fields::data::{FieldData, RayLists, heart_shifts_ignored};
+use crate::fields::motion::{self, Thresholds, ViewMotion};
 use crate::fields::scale::dynamic_half;
 use crate::fields::state;
 use crate::fitting::extent::between_phases;
@@ -19,15 +20,14 @@ use crate::scan::dataset::Dataset;
 
 /// The method, for the registry.
 pub static METHOD: Method = Method {
-    kind: MethodKind::NertCa,
     checkpoint_format: state::FORMAT,
     smaller_steps: "a lower static.lr or dynamic.lr, or a longer dynamic.delay",
     boxes_hold_all_rays: false,
     plan,
-    read: state::read,
+    read,
     make_pipelines: |_, _, _| Ok(()),
-    rays_per_iteration: |config| config.train.rays,
-    lower_rates: data::lower_rates,
+    rays_per_iteration: |config| config.fields().map_or(0, |settings| settings.rays),
+    lower_rates,
     abilities: Abilities::NONE,
 };
 
@@ -35,15 +35,44 @@ pub static METHOD: Method = Method {
 fn plan(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
     notes.extend(heart_shifts_ignored(dataset));
     notes.extend(between_phases(dataset, "are trained at their own time"));
-    let motion = motion::analyse(dataset, &config.hull);
-    let hull = choose_hull(config, dataset, &motion, notes);
-    let scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
-    let lists = RayLists::of_hull(config, dataset, &motion, hull.as_ref());
-    Ok(FieldData::new(config, dataset, &motion, hull, scene, lists)?.into())
+    let (config, settings) = (config.of::<NertCaSettings>()?, settings_of(config)?);
+    let NertCaHull { min_share, min_share_few_views, dilate_pixels, .. } = config.hull;
+    let motion = motion::analyse(dataset, Thresholds { min_share, min_share_few_views, dilate_pixels });
+    let hull =
+        choose_hull(&config.hull, dynamic_half(config.dynamic.half_extent_mm, dataset), dataset, &motion, notes);
+    let scene = Scene::new(&settings, dataset, &motion, hull.as_ref())?;
+    let lists = RayLists::of_hull(dataset, &motion, hull.as_ref());
+    Ok(FieldData::new(&settings, dataset, &motion, hull, scene, lists)?.into())
 }
 
-fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes: &mut Vec<String>) -> Option<Hull> {
-    if !config.hull.enabled {
+/// Reads the fields and the state of their fit from a checkpoint.
+fn read(sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
+    state::read(sections, &settings_of(config)?, at, file)
+}
+
+/// Lowers the learning rates by a factor.
+fn lower_rates(config: &mut Config, factor: f64) {
+    let Settings::NertCa(own) = &mut config.method else { return };
+    // All bands are open.
+    own.network.window_iterations = 0;
+    own.network.lr_end *= factor;
+    own.static_field.lr_end *= factor;
+    (own.network.lr, own.static_field.lr) = (own.network.lr_end, own.static_field.lr_end);
+}
+
+/// Returns the settings of the fields of a configuration.
+fn settings_of(config: &Config) -> Result<FieldSettings> {
+    config.fields().ok_or_else(|| Error::Internal("the configuration has no fields".into()))
+}
+
+fn choose_hull(
+    settings: &NertCaHull,
+    half: f64,
+    dataset: &Dataset,
+    motion: &[ViewMotion],
+    notes: &mut Vec<String>,
+) -> Option<Hull> {
+    if !settings.enabled {
         return None;
     }
     let single_phase: Vec<_> = motion.iter().filter(|m| m.n_phases < 2).map(|m| m.view).collect();
@@ -51,17 +80,16 @@ fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes:
         notes.push(format!("the motion hull is not used: views {single_phase:?} have a single phase"));
         return None;
     }
-    let half = dynamic_half(config, dataset);
-    let hull = carve(dataset, motion, half, config.hull.resolution as usize, config.hull.per_phase);
+    let hull = carve(dataset, motion, half, settings.resolution as usize, true);
     let share = hull.share();
     if share == 0.0 {
         notes.push("the motion hull is not used: at no point is there motion in all views that see it".into());
         None
-    } else if share > config.hull.max_share {
+    } else if share > settings.max_share {
         notes.push(format!(
-            "the motion hull is not used: it would keep {:.0} % of the box, and more than {:.0} % saves nothing",
+            "the motion hull is not used: it would keep {:.0} % of the box, and at most {:.0} % are of use",
             100.0 * share,
-            100.0 * config.hull.max_share
+            100.0 * settings.max_share
         ));
         None
     } else {

@@ -13,8 +13,8 @@ pub mod state;
 mod tensors;
 pub mod trainer;
 
-use crate::config::method::MethodKind;
-use crate::config::{Config, StaticData};
+use crate::config::sections::R2Settings;
+use crate::config::{Config, Method as Settings, StaticData};
 use crate::error::Result;
 use crate::fields::scale::FieldVolume;
 use crate::fitting::extent::volume_half;
@@ -43,7 +43,6 @@ use trainer::R2Trainer;
 
 /// The method, for the registry.
 pub static METHOD: Method = Method {
-    kind: MethodKind::R2Gaussian,
     checkpoint_format: crate::gaussians::tensors::FORMAT,
     smaller_steps: state::SMALLER_STEPS,
     boxes_hold_all_rays: false,
@@ -63,9 +62,10 @@ pub static METHOD: Method = Method {
 
 /// Prepares a fit.
 fn plan(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
+    let config = &config.of::<R2Settings>()?;
     let volume = FieldVolume { half: volume_half(config.r2.half_extent_mm, dataset), attenuation: None };
     let data = data_of(config, dataset, notes)?;
-    Ok(PlannedFit::of_images(Scene::of_volume(config, dataset, volume)?, data))
+    Ok(PlannedFit::of_images(Scene::of_volume(dataset, volume), data))
 }
 
 /// Reads the field and the state of its fit from a checkpoint.
@@ -77,19 +77,15 @@ fn read(sections: &serde_json::Value, _: &Config, at: SavedAt, file: &File<'_>) 
 
 /// Lowers the learning rates by a factor.
 fn lower_rates(config: &mut Config, factor: f64) {
-    config.r2.position_rate *= factor;
-    config.r2.position_rate_end *= factor;
-    config.r2.density_rate *= factor;
-    config.r2.density_rate_end *= factor;
-    config.r2.scale_rate *= factor;
-    config.r2.scale_rate_end *= factor;
-    config.r2.rotation_rate *= factor;
-    config.r2.rotation_rate_end *= factor;
+    let Settings::R2Gaussian(R2Settings { r2 }) = &mut config.method else { return };
+    for rate in [&mut r2.position_rate, &mut r2.density_rate, &mut r2.scale_rate, &mut r2.rotation_rate] {
+        *rate *= factor;
+    }
 }
 
 /// Builds the pipelines of fits.
 fn make_pipelines(gpu: &Gpu, config: &Config, tuning: &Tuning) -> Result<()> {
-    R2Kernels::new(gpu, config.r2.integral)?;
+    R2Kernels::new(gpu, config.of::<R2Settings>()?.r2.integral)?;
     // A stage of other fits draws the pictures.
     Build::default().stage::<push::GaussianProject>(gpu)?;
     BlobKernels::new(gpu, tuning)?;
@@ -97,7 +93,7 @@ fn make_pipelines(gpu: &Gpu, config: &Config, tuning: &Tuning) -> Result<()> {
 }
 
 /// Prepares R2-Gaussian's data, and notes about them for the user.
-fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<R2Data> {
+fn data_of(config: &Config<R2Settings>, dataset: &Dataset, notes: &mut Vec<String>) -> Result<R2Data> {
     let half = volume_half(config.r2.half_extent_mm, dataset);
     let data = R2Data::new(dataset, &config.r2, half)?;
     let side_mm = 2.0 * half * MM_PER_UNIT;
@@ -124,7 +120,7 @@ fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
 
 /// Begins a fit, or goes on where a saved one has ended.
 fn begin(data: R2Data, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<ShownFit<R2Trainer>> {
-    let FitStart { gpu, config, from, .. } = *start;
+    let (gpu, config, from) = (start.gpu, &start.config.of()?, start.from);
     let step = from.field_to(Use::Resume).and_then(|field| Some(field.gaussians.as_ref()?.rows().step));
     let trainer = match from.state_as::<R2State>().zip(step) {
         Some((state, step)) => R2Trainer::with(gpu, data, config, state, step)?,

@@ -11,8 +11,8 @@ pub mod state;
 mod tensors;
 pub mod trainer;
 
-use crate::config::method::MethodKind;
-use crate::config::{Config, StaticData};
+use crate::config::sections::XSettings;
+use crate::config::{Config, Method as Settings, StaticData};
 use crate::error::Result;
 use crate::fields::scale::FieldVolume;
 use crate::fitting::extent::volume_half;
@@ -42,7 +42,6 @@ use trainer::XTrainer;
 
 /// The method, for the registry.
 pub static METHOD: Method = Method {
-    kind: MethodKind::XGaussian,
     checkpoint_format: crate::gaussians::tensors::FORMAT,
     smaller_steps: state::SMALLER_STEPS,
     boxes_hold_all_rays: false,
@@ -62,9 +61,10 @@ pub static METHOD: Method = Method {
 
 /// Prepares a fit.
 fn plan(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
+    let config = &config.of::<XSettings>()?;
     let volume = FieldVolume { half: volume_half(config.x.half_extent_mm, dataset), attenuation: None };
     let data = data_of(config, dataset, notes)?;
-    Ok(PlannedFit::of_images(Scene::of_volume(config, dataset, volume)?, data))
+    Ok(PlannedFit::of_images(Scene::of_volume(dataset, volume), data))
 }
 
 /// Reads the field and the state of its fit from a checkpoint.
@@ -76,12 +76,10 @@ fn read(sections: &serde_json::Value, _: &Config, at: SavedAt, file: &File<'_>) 
 
 /// Lowers the learning rates by a factor.
 fn lower_rates(config: &mut Config, factor: f64) {
-    config.x.position_rate *= factor;
-    config.x.position_rate_end *= factor;
-    config.x.intensity_rate *= factor;
-    config.x.opacity_rate *= factor;
-    config.x.scale_rate *= factor;
-    config.x.rotation_rate *= factor;
+    let Settings::XGaussian(XSettings { x }) = &mut config.method else { return };
+    let positions = [&mut x.position_rate, &mut x.position_rate_end];
+    let others = [&mut x.intensity_rate, &mut x.opacity_rate, &mut x.scale_rate, &mut x.rotation_rate];
+    positions.into_iter().chain(others).for_each(|rate| *rate *= factor);
 }
 
 /// Builds the pipelines of fits.
@@ -95,7 +93,7 @@ fn make_pipelines(gpu: &Gpu, _: &Config, tuning: &Tuning) -> Result<()> {
 }
 
 /// Prepares X-Gaussian's data, and notes about them for the user.
-fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<XData> {
+fn data_of(config: &Config<XSettings>, dataset: &Dataset, notes: &mut Vec<String>) -> Result<XData> {
     let half = volume_half(config.x.half_extent_mm, dataset);
     let data = XData::new(dataset, &config.x, half)?;
     let side_mm = 2.0 * half * MM_PER_UNIT;
@@ -123,7 +121,7 @@ fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
 
 /// Begins a fit, or goes on where a saved one has ended.
 fn begin(data: XData, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<ShownFit<XTrainer>> {
-    let FitStart { gpu, config, from, .. } = *start;
+    let (gpu, config, from) = (start.gpu, &start.config.of()?, start.from);
     let step = from.field_to(Use::Resume).and_then(|field| Some(field.gaussians.as_ref()?.rows().step));
     let trainer = match from.state_as::<XState>().zip(step) {
         Some((state, step)) => XTrainer::with(gpu, data, config, state, step)?,

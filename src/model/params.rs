@@ -5,10 +5,14 @@
 //! output bias, latents. Every slice starts at a multiple of 4 so that shaders can read vec4. Padding is zero, gets zero
 //! gradient and so stays zero.
 
-use crate::config::sections::DynamicField;
-use crate::config::{Config, StaticForm};
+use crate::config::Config;
+use crate::config::fields::{FieldSettings, StaticField};
+use crate::config::sections::Network;
 use crate::random::{STREAM_INIT, normal, uniform01};
 use std::ops::Range;
+
+/// Standard deviation of the initial planes and lines, as in the authors' code.
+const INIT_STD: f64 = 0.01;
 
 /// Positions of the parts of one hidden layer.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -85,7 +89,7 @@ pub struct Tensor {
 impl NetworkMap {
     /// Returns the map of a network with the dynamic field's shape, from parameter `first` on, with `latent` numbers for each
     /// phase.
-    fn new(shape: &DynamicField, first: usize, latent: usize, phases: usize) -> NetworkMap {
+    fn new(shape: &Network, first: usize, latent: usize, phases: usize) -> NetworkMap {
         let width = shape.width as usize;
         let encoded_len = 3 + 6 * shape.bands as usize;
         let encode_groups = encoded_len.div_ceil(4);
@@ -184,16 +188,20 @@ fn tensor(name: String, shape: Vec<usize>, positions: Vec<usize>) -> Tensor {
 impl ParamMap {
     /// Returns the map for a configuration and a number of phases.
     pub fn new(config: &Config, phases: usize) -> ParamMap {
-        let (s, d) = (&config.static_field, &config.dynamic);
-        let (grid, ranks, static_network) = match s.form {
-            StaticForm::Tensor => (s.grid as usize, s.ranks as usize, None),
-            StaticForm::Network => (0, 0, Some(NetworkMap::new(d, 0, 0, phases))),
-            StaticForm::None => (0, 0, None),
+        ParamMap::of(config.fields().as_ref(), phases)
+    }
+
+    /// Returns the map for fields and a number of phases; an empty one without fields.
+    pub fn of(settings: Option<&FieldSettings>, phases: usize) -> ParamMap {
+        let network = settings.and_then(|settings| settings.network.as_ref());
+        let (grid, ranks, static_network): (usize, usize, _) = match settings.map(|settings| &settings.static_field) {
+            Some(StaticField::Tensor(tensor)) => (tensor.grid as usize, tensor.ranks as usize, None),
+            Some(StaticField::Network(_)) => (0, 0, network.map(|shape| NetworkMap::new(shape, 0, 0, phases))),
+            None => (0, 0, None),
         };
         let rank4 = ranks.div_ceil(4);
         let static_len = static_network.as_ref().map_or(3 * (grid * grid + grid) * rank4 * 4, |network| network.len);
-        let has_network = config.method().has_network();
-        let dynamic_network = has_network.then(|| NetworkMap::new(d, static_len, d.latent as usize, phases));
+        let dynamic_network = network.map(|shape| NetworkMap::new(shape, static_len, shape.latent as usize, phases));
         let len = static_len + dynamic_network.as_ref().map_or(0, |network| network.len);
         ParamMap { grid, ranks, rank4, static_len, static_network, dynamic_network, phases, len }
     }
@@ -249,9 +257,9 @@ impl ParamMap {
         out
     }
 
-    /// Returns the initial values: planes and lines `init_std * N(0, 1)`, linear layers uniform in `+-1/sqrt(inputs)` (torch's
+    /// Returns the initial values: planes and lines `INIT_STD * N(0, 1)`, linear layers uniform in `+-1/sqrt(inputs)` (torch's
     /// default), latents uniform in [0, 1).
-    pub fn initial(&self, config: &Config) -> Vec<f32> {
+    pub fn initial(&self, seed: u32) -> Vec<f32> {
         let mut params = vec![0f32; self.len];
         for (index, tensor) in self.tensors().into_iter().enumerate() {
             let is_static = tensor.name.starts_with("static.");
@@ -260,9 +268,9 @@ impl ParamMap {
             for (i, &at) in tensor.positions.iter().enumerate() {
                 let (a, b) = (index as u32, i as u32);
                 params[at as usize] = match inputs {
-                    Some(Some(n)) => (uniform01(config.seed, STREAM_INIT, a, b) * 2.0 - 1.0) / (n as f64).sqrt(),
-                    Some(None) => uniform01(config.seed, STREAM_INIT, a, b),
-                    None => config.static_field.init_std * normal(config.seed, STREAM_INIT, a, b),
+                    Some(Some(n)) => (uniform01(seed, STREAM_INIT, a, b) * 2.0 - 1.0) / (n as f64).sqrt(),
+                    Some(None) => uniform01(seed, STREAM_INIT, a, b),
+                    None => INIT_STD * normal(seed, STREAM_INIT, a, b),
                 } as f32;
             }
         }
@@ -315,7 +323,7 @@ mod tests {
     fn layers_start_within_one_over_the_root_of_their_inputs() {
         let config = Config::preset(Preset::NerfCa);
         let map = ParamMap::new(&config, 10);
-        let params = map.initial(&config);
+        let params = map.initial(config.seed);
         for (name, inputs) in [
             ("static.layer0.weight", 75.0),
             ("static.layer3.bias", 128.0),

@@ -365,6 +365,7 @@ impl Path for FusedNetwork {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::sections::NertCaSettings;
     use crate::config::{Config, Preset};
     use crate::model::params::ParamMap;
     use crate::network::SAMPLE_BYTES;
@@ -402,9 +403,9 @@ mod tests {
     #[test]
     fn layers_are_paired_from_the_first_up() {
         let spans_of = |layers: usize, skip_layer: usize, pairs: bool| {
-            let mut config = Config::preset(Preset::Paper);
-            (config.dynamic.layers, config.dynamic.skip_layer) = (layers as u32, skip_layer as u32);
-            let spans = spans(&ParamMap::new(&config, 10).dynamic_network.unwrap().layers, pairs);
+            let mut config = Config::preset(Preset::Paper).of::<NertCaSettings>().unwrap();
+            (config.network.layers, config.network.skip_layer) = (layers as u32, skip_layer as u32);
+            let spans = spans(&ParamMap::new(&config.into_any(), 10).dynamic_network.unwrap().layers, pairs);
             spans.iter().map(|span| (span.upper, span.lower)).collect::<Vec<_>>()
         };
         use LayerInput::{Encoded, Hidden};

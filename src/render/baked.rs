@@ -1,6 +1,6 @@
 //! Fields baked into 3D images, for display rates.
 
-use crate::config::StaticForm;
+use crate::config::fields::StaticField;
 use crate::error::{Error, Result};
 use crate::geometry::{MM_PER_UNIT, ViewRays};
 use crate::gpu::buffer::{Buffer, Memory};
@@ -88,10 +88,10 @@ impl Baked {
         let scene = &model.scene;
         let extent = (0..3).map(|i| scene.dynamic_max[i] - scene.dynamic_min[i]).fold(0.0, f64::max);
         let dynamic_cells = ((extent * MM_PER_UNIT / cell_mm).ceil() as u32).clamp(MIN_BAKED_CELLS, BAKED_CELLS);
-        let static_cells = match model.config.static_field.form {
-            StaticForm::Tensor => (2 * model.config.static_field.grid).clamp(MIN_BAKED_CELLS, BAKED_CELLS),
-            StaticForm::Network => dynamic_cells,
-            StaticForm::None => MIN_BAKED_CELLS,
+        let static_cells = match model.config.fields().map(|settings| settings.static_field) {
+            Some(StaticField::Tensor(tensor)) => (2 * tensor.grid).clamp(MIN_BAKED_CELLS, BAKED_CELLS),
+            Some(StaticField::Network(_)) => dynamic_cells,
+            None => MIN_BAKED_CELLS,
         };
         Self::empty(renderer, static_cells, dynamic_cells)
     }

@@ -1,7 +1,7 @@
 //! Some drivers offer cooperative matrices that are slower than f32: both paths are timed once per device, driver and
 //! network, and the verdict is kept.
 
-use crate::config::{Config, StaticForm};
+use crate::config::Config;
 use crate::error::Result;
 use crate::files;
 use crate::gpu::capabilities::DeviceInfo;
@@ -62,17 +62,20 @@ const FILE: &str = "paths.json";
 
 /// Key of the device, driver and network that a verdict holds for.
 fn key(info: &DeviceInfo, config: &Config) -> String {
-    let (d, rays, samples) = (&config.dynamic, config.train.rays, config.march.dynamic_samples);
-    let networks = if config.static_field.form == StaticForm::Network { "two networks of " } else { "" };
+    let Some((settings, network)) = config.fields().and_then(|s| Some((s.clone(), s.network?))) else {
+        return format!("{} | {} | {} | no network", info.uuid, info.driver, env!("CARGO_PKG_VERSION"));
+    };
+    let (rays, samples) = (settings.rays, settings.march.dynamic_samples);
+    let networks = if settings.networks.is_some() { "two networks of " } else { "" };
     format!(
         "{} | {} | {} | {networks}{} layers of {}, skip {}, {} bands | {rays} rays of {samples} samples",
         info.uuid,
         info.driver,
         env!("CARGO_PKG_VERSION"),
-        d.layers,
-        d.width,
-        d.skip_layer,
-        d.bands
+        network.layers,
+        network.width,
+        network.skip_layer,
+        network.bands
     )
 }
 

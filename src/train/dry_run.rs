@@ -29,7 +29,7 @@ pub struct DryRun {
 /// [`crate::error::Error::Diverged`] when a loss or a parameter is not finite; errors of the configuration, the data and the
 /// device.
 pub fn dry_run(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<DryRun> {
-    let short = config.of_dry_run()?;
+    let short = config.of_dry_run();
     let iterations = short.train.iterations;
     let mut trainer = Trainer::new(gpu, Plan::new(&short, dataset)?, dataset, tuning.clone())?;
     let (begin, mut last_loss) = (Instant::now(), f64::NAN);

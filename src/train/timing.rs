@@ -1,6 +1,5 @@
 //! Timing of training iterations.
 
-use crate::choice::Choice;
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::fitting::fit::{FitData, FitStart, Measured, Start};
@@ -184,11 +183,11 @@ impl Subject {
     /// Errors of the configuration, the data and the device.
     pub fn new(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning, with_network: bool) -> Result<Subject> {
         let mut config = config.clone();
-        let max = MAX_ITERATIONS.min(u32::MAX / config.train.rays);
-        config.train.iterations = max;
         let method = methods::of(&config);
+        let max = MAX_ITERATIONS.min(u32::MAX / (method.rays_per_iteration)(&config).max(1));
+        config.train.iterations = max;
         (method.lower_rates)(&mut config, SLOWLY);
-        config.dynamic.delay = if with_network { 0 } else { config.train.iterations };
+        config.delay_network(if with_network { 0 } else { max });
         let plan = Plan::new(&config, dataset)?;
         let (cost, n_rays) = (NetworkCost::of(&plan.params), (method.rays_per_iteration)(&config));
         let trainer = Trainer::new(gpu, plan, dataset, tuning.clone())?;
@@ -320,16 +319,14 @@ impl GaussianSubject {
         profiled: u32,
     ) -> Result<GaussianSubject> {
         let mut config = config.clone();
-        let (of_fit, is_alone) = (config.gaussians.iterations, config.method().is_alone());
-        let of_fit = if is_alone { config.train.iterations.min(ALONE_TIMED) } else { of_fit };
+        let of_fit = config.gaussian_iterations().min(MAX_TIMED);
         let timed = match length {
             Length::Iterations(n) => n,
             Length::Seconds(_) => of_fit.saturating_sub(WARM_UP).max(1),
         };
         let min = WARM_UP + timed;
-        config.gaussians.iterations = config.gaussians.iterations.max(min) + profiled;
-        if is_alone {
-            config.train.iterations = config.train.iterations.max(min) + profiled;
+        if let Some(iterations) = config.gaussian_iterations_mut() {
+            *iterations = (*iterations).max(min) + profiled;
         }
         let mut plan = Plan::new(&config, dataset)?;
         let data = plan.data.take().ok_or_else(|| Error::Internal("the plan has no data".into()))?;
@@ -390,7 +387,7 @@ impl GaussianSubject {
         let (host_cpu_share, readings) = meanwhile.end();
         let work = last.fit.work()?.ok_or_else(|| without_gaussians(&self.config))?;
         let timing = GaussianTiming {
-            form: work.form.unwrap_or_else(|| self.config.gaussians.form.name()).into(),
+            form: work.form.unwrap_or_else(|| self.config.method_name()).into(),
             count: work.count,
             grows: self.config.method().is_alone(),
             preparation_s: median(&preparation_s),

@@ -35,7 +35,7 @@ pub struct Trainer {
 /// Refuses to continue with fields of another shape.
 fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
     let saved = &checkpoint.model;
-    if saved.param_map == plan.params && saved.config.method() == plan.config.method() {
+    if saved.param_map == plan.params && saved.config.is_alike(&plan.config) {
         return Ok(());
     }
     Err(Error::config(
@@ -125,7 +125,7 @@ impl Trainer {
     /// # Errors
     /// Errors of [`Trainer::new`].
     pub fn begin(gpu: &Gpu, mut plan: Plan, dataset: &Dataset, tuning: Tuning, from: Start<'_>) -> Result<Trainer> {
-        let tuning = tuning.for_network(plan.config.method().has_network());
+        let tuning = tuning.for_network(plan.config.has_network());
         let mut config = plan.config.clone();
         config.train.iterations_per_submit = tuning.iterations_per_submit.unwrap_or(config.train.iterations_per_submit);
         let data = plan.data.take().ok_or_else(|| Error::Internal("a fit has begun with these data".into()))?;
@@ -135,7 +135,7 @@ impl Trainer {
             large_loss: None,
             findings: Vec::new(),
             // A blended picture is no sum of attenuations.
-            vessel_attenuation: dataset.vessel_attenuation.filter(|_| !plan.config.method().is_blended()),
+            vessel_attenuation: dataset.vessel_attenuation.filter(|_| !plan.config.is_blended()),
             c_arm: dataset.reference_c_arm(),
             image_size: dataset.reference_view().size,
             data_fingerprint: data_fingerprint(dataset),

@@ -106,7 +106,7 @@ fn model(preset: &str, moving: Option<GaussianField>) -> Model {
     let dataset = small_dataset(SIZE[0], SIZE[1]);
     let plan = Plan::new(&small_config(preset, &[]), &dataset).unwrap();
     Model {
-        params: plan.params.initial(&plan.config),
+        params: plan.params.initial(plan.config.seed),
         config: plan.config,
         scene: plan.scene,
         param_map: plan.params,

@@ -300,7 +300,6 @@ fn a_field_everywhere_has_no_distance_and_trains_on() {
     let settings = [
         "train.rays=32",
         "train.validate_every=1",
-        "train.validate_images=1",
         "march.static_samples=32",
         "march.dynamic_samples=32",
         "march.render_samples=32",

@@ -9,6 +9,7 @@ use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::model::scene::Scene;
 use nertca_vk::plan::Plan;
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
+use nertca_vk::selftest::problems::with_values;
 
 impl Golden {
     pub fn number(&self, key: &str) -> f64 {
@@ -104,7 +105,7 @@ impl Golden {
             format!("adam.epsilon={}", n("eps")),
             "hull.enabled=false".into(),
         ];
-        Config::preset(preset).with_constants(&settings).unwrap()
+        with_values(&Config::preset(preset), settings.iter().map(String::as_str)).unwrap()
     }
 
     /// Settings of two networks, whose losses are delayed instead of the field.
@@ -137,10 +138,16 @@ impl Golden {
             }
         }
         // The script has the earlier names of two settings.
-        for key in ["gain", "ramp", "least_change", "least_integral", "change_weight"] {
-            settings.push(format!("networks.{key}={}", n(key)));
+        for (key, golden) in [
+            ("gain", "gain"),
+            ("ramp", "ramp"),
+            ("min_change", "least_change"),
+            ("min_integral", "least_integral"),
+            ("change_weight", "change_weight"),
+        ] {
+            settings.push(format!("networks.{key}={}", n(golden)));
         }
-        Config::preset(Preset::NerfCa).with_constants(&settings).unwrap()
+        with_values(&Config::preset(Preset::NerfCa), settings.iter().map(String::as_str)).unwrap()
     }
 
     pub fn scene(&self) -> Scene {

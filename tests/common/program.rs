@@ -3,6 +3,7 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "shared by tests")]
 
 use nertca_vk::config::{Config, Preset};
+use nertca_vk::selftest::problems::with_values;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
@@ -23,8 +24,7 @@ fn cache() -> &'static Path {
 /// Writes a whole configuration, which may have other constants than the program, for `--config`.
 #[allow(dead_code, reason = "not every test changes constants")]
 pub fn whole_config(directory: &Path, preset: Preset, constants: &[&str]) -> PathBuf {
-    let constants: Vec<String> = constants.iter().map(|setting| (*setting).to_owned()).collect();
-    let config = Config::preset(preset).with_constants(&constants).unwrap();
+    let config = with_values(&Config::preset(preset), constants.iter().copied()).unwrap();
     let path = directory.join("whole-config.toml");
     std::fs::write(&path, config.to_toml().unwrap()).unwrap();
     path

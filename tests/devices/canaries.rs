@@ -42,8 +42,7 @@ fn everything(word: u32, preset: &str, settings: &[&str], choose: &dyn Fn(Tuning
     let gpu = gpu();
     let tuning = choose(Tuning::for_device(gpu.info()));
     let config = small_config(preset, settings);
-    let (width, height) =
-        if config.gaussians.form != nertca_vk::config::GaussianForm::None { (40, 36) } else { (13, 11) };
+    let (width, height) = if config.gaussian_iterations() > 0 { (40, 36) } else { (13, 11) };
     let dataset = small_dataset(width, height);
     let plan = Plan::new(&config, &dataset).unwrap();
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning.clone()).unwrap();
@@ -117,8 +116,8 @@ fn gaussians_mind_their_buffers() {
             "gaussians.clear_at=8",
             "gaussians.background_every=5",
             "gaussians.count=60",
-            "tree.warm_iterations=6",
-            "tree.track_iterations=3",
+            "deformable.warm_iterations=6",
+            "deformable.track_iterations=3",
         ]
     };
     for form in ["gaussians.form=phase", "gaussians.form=tree"] {

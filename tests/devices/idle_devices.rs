@@ -39,16 +39,16 @@ fn train(config: &Config, silent_stage: Option<&str>) -> Result<u32, Error> {
 fn every_trainer_says_that_it_is_told_nothing() {
     let gaussians = |form: &str| {
         let settings = [format!("gaussians.form={form}"), "gaussians.iterations=8".into(), "gaussians.count=40".into()];
-        Config::preset(Preset::Fast).with_constants(&settings).unwrap()
+        Config::preset(Preset::Fast).with(&settings).unwrap()
     };
     for (stage, config) in [
         ("report", problems::small_config(Preset::FastMlp, &[]).unwrap()),
         ("report", problems::small_config(Preset::NerfCa, &[]).unwrap()),
         ("gaussian_report", gaussians("phase")),
         ("gaussian_report", gaussians("tree")),
-        ("gaussian_report", r2::small_config(&[]).unwrap()),
-        ("sax_report", sax::small_config(&[]).unwrap()),
-        ("x_report", x_gaussian::small_config(&[]).unwrap()),
+        ("gaussian_report", r2::small_config(&[]).unwrap().into_any()),
+        ("sax_report", sax::small_config(&[]).unwrap().into_any()),
+        ("x_report", x_gaussian::small_config(&[]).unwrap().into_any()),
     ] {
         assert_eq!(train(&config, None).map_err(|e| e.to_string()), Ok(3), "{stage} as it is");
         match train(&config, Some(stage)) {

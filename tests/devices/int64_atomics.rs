@@ -48,7 +48,7 @@ fn bits_of_a_run(gpu: &Gpu, private_line_bytes: u32) -> Vec<u64> {
 /// Bits of losses and parameters of SAX-NeRF, whose grid is scattered to in the same way.
 fn bits_of_a_grid(gpu: &Gpu) -> Vec<u64> {
     let dataset = small_dataset(13, 11);
-    let plan = Plan::new(&sax::small_config(&[]).unwrap(), &dataset).unwrap();
+    let plan = Plan::new(&sax::small_config(&[]).unwrap().into_any(), &dataset).unwrap();
     let mut trainer = Trainer::new(gpu, plan, &dataset, tuning(gpu)).unwrap();
     let losses = run(&mut trainer, 6);
     let checkpoint = trainer.checkpoint().unwrap().to_bytes().unwrap();

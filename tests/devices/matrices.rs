@@ -172,7 +172,7 @@ fn an_overflow_skips_the_update_and_lowers_the_scale_for_a_while() {
     let Some((gpu, tuning)) = matrices() else { return };
     let dataset = small_dataset(13, 11);
     let plan = Plan::new(&small_config("fast-mlp", &["train.iterations=100"]), &dataset).unwrap();
-    let (before, first) = (plan.params.initial(&plan.config), plan.params.static_len);
+    let (before, first) = (plan.params.initial(plan.config.seed), plan.params.static_len);
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning).unwrap();
     let huge = DeviceState { loss_scale: 2f32.powi(60), good_updates: 7, ..DeviceState::default() };
     gpu.upload(&trainer.fields().unwrap().forward().state, 0, &[huge]).unwrap();

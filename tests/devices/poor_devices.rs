@@ -88,7 +88,7 @@ fn images_larger_than_a_buffer_are_fitted_alike() {
     assert!(targets.n_images > 16, "{} images", targets.n_images);
     let rows = problems::random_gaussians(60, 1, 20.0, 4);
     // The background is renewed after 40 iterations.
-    let config = Config::preset(Preset::Fast);
+    let config = problems::default_rules().unwrap();
     let fitted = |gpu: &Gpu| {
         let particles = Particles::fresh(rows.clone());
         let mut trainer = DeformableTrainer::with(gpu, targets.clone(), &config, &particles).unwrap();
@@ -206,7 +206,7 @@ fn memory_that_others_hold_is_told_before_a_fit_takes_any() {
     assert_eq!((told, gpu.memory().free), (free, Some(free)));
     let dataset = small_dataset(13, 11);
     let begin = |settings: &[&str]| {
-        let plan = Plan::new(&sax::small_config(settings).unwrap(), &dataset).unwrap();
+        let plan = Plan::new(&sax::small_config(settings).unwrap().into_any(), &dataset).unwrap();
         Trainer::new(&gpu, plan, &dataset, Tuning::for_device(gpu.info())).map(|_| ())
     };
     let error = begin(&["sax.num_levels=8", "sax.base_resolution=16", "sax.log2_hashmap_size=16"]).unwrap_err();

@@ -114,18 +114,21 @@ fn builds<'a>(all: impl IntoIterator<Item = &'a PipelineStatistics>) -> BTreeSet
 fn the_inventory_is_what_a_run_builds() {
     let open = || Gpu::open(&DeviceOptions { statistics: true, ..DeviceOptions::default() }).unwrap();
     for (preset, size, form) in [
-        (Preset::Paper, 13, "none"),
-        (Preset::NerfCa, 13, "none"),
-        (Preset::Fast, 32, "tree"),
-        (Preset::Fast, 32, "phase"),
-        (Preset::R2Gaussian, 13, "r2"),
-        (Preset::XGaussian, 13, "x"),
-        (Preset::SaxNerf, 13, "none"),
+        (Preset::Paper, 13, None),
+        (Preset::NerfCa, 13, None),
+        (Preset::Fast, 32, Some("deformable")),
+        (Preset::Fast, 32, Some("phase")),
+        (Preset::R2Gaussian, 13, None),
+        (Preset::XGaussian, 13, None),
+        (Preset::SaxNerf, 13, None),
     ] {
         let short = match preset {
-            Preset::Fast => {
-                &["gaussians.iterations=2", "gaussians.count=20", "tree.warm_iterations=2", "tree.track_iterations=1"][..]
-            }
+            Preset::Fast => &[
+                "gaussians.iterations=2",
+                "gaussians.count=20",
+                "deformable.warm_iterations=2",
+                "deformable.track_iterations=1",
+            ][..],
             Preset::R2Gaussian => &["train.iterations=2", "r2.n_points=20", "r2.voxels=16", "r2.tv_vol_size=8"],
             Preset::XGaussian => &["train.iterations=2", "x.voxels=8", "x.interval=2"],
             Preset::SaxNerf => {
@@ -133,9 +136,9 @@ fn the_inventory_is_what_a_run_builds() {
             }
             _ => &[],
         };
-        let form = format!("gaussians.form={form}");
-        let settings: Vec<String> = short.iter().map(|s| (*s).to_owned()).chain([form]).collect();
-        let config = Config::preset(preset).with_constants(&settings).unwrap();
+        let form = form.map(|form| format!("gaussians.form={form}"));
+        let settings: Vec<&str> = short.iter().copied().chain(form.as_deref()).collect();
+        let config = problems::with_values(&Config::preset(preset), settings.iter().copied()).unwrap();
         let listed = open();
         let inventory = inventory::compile(&listed, &config, 3, &tuning(&listed)).unwrap();
         let names: BTreeSet<String> = inventory.iter().map(Compiled::name).collect();

@@ -6,6 +6,7 @@ use glam::DVec3;
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::calibrate::pose::Poses;
 use nertca_vk::calibrate::{adjusted, calibrate};
+use nertca_vk::config::sections::GaussiansSettings;
 use nertca_vk::config::{AdjustMode, Config, Preset};
 use nertca_vk::fields::scale::dynamic_half;
 use nertca_vk::fitting::fit::{AdjustTask, FitField, MadeFit, Start, Use};
@@ -19,6 +20,7 @@ use nertca_vk::methods::dynamic_gaussians::adjust::residual::misfit;
 use nertca_vk::methods::dynamic_gaussians::adjust::step::FieldInLoop;
 use nertca_vk::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use nertca_vk::methods::dynamic_gaussians::made::MadeGaussians;
+use nertca_vk::methods::dynamic_gaussians::rules::Rules;
 use nertca_vk::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use nertca_vk::methods::dynamic_gaussians::targets::Targets;
 use nertca_vk::plan::Plan;
@@ -31,19 +33,19 @@ use std::time::Duration;
 
 const SIZE: usize = 64;
 
-fn fast() -> Config {
-    Config::preset(Preset::Fast)
+fn fast() -> Config<GaussiansSettings> {
+    Config::preset(Preset::Fast).of().unwrap()
 }
 
 /// A short fit to the stated geometry of a dataset.
 fn fitted(gpu: &Gpu, dataset: &Dataset) -> DeformableTrainer {
-    let mut config = fast();
+    let mut config = Rules::of(&fast());
     config.gaussians.iterations = 60;
     // As broad as where poses are adjusted.
     config.gaussians.min_scale = 1.2;
     // Where a Gaussian is cut off, its image has no derivative.
     config.gaussians.cut = 5.0;
-    let motion = SoftMotion::new(dataset, dynamic_half(&config, dataset), 96);
+    let motion = SoftMotion::new(dataset, dynamic_half(0.0, dataset), 96);
     let targets = Targets::new(dataset, &motion, &config.gaussians).unwrap();
     let mut trainer = DeformableTrainer::new(gpu, targets, &config).unwrap();
     while trainer.step() < config.gaussians.iterations {
@@ -181,7 +183,7 @@ fn error_px(shot: &Shot, dataset: &Dataset) -> f64 {
 
 /// Adjusts the views of a shot, starting from a calibration, and returns the calibration and the fit that the run takes over.
 fn adjust(gpu: &Gpu, shot: &Shot, calibration: &Calibration) -> (Calibration, MadeFit) {
-    let config = fast();
+    let config = fast().into_any();
     let task = AdjustTask { gpu, config: &config, dataset: &shot.dataset, calibration };
     let outcome = methods::of(&config).abilities.adjust_views.unwrap()(&task, &mut |_| Ok(())).unwrap().unwrap();
     let after = adjusted(&shot.dataset, calibration.clone(), outcome.adjusted).unwrap();
@@ -195,11 +197,11 @@ fn made_before(made: &MadeFit) -> Start<'_> {
 
 /// Trains to the end of the Gaussians with and without the fit that an adjustment has left, and checks that the results are the same.
 fn expect_taken_over(gpu: &Gpu, dataset: &Dataset, made: &MadeFit) {
-    let config = fast();
+    let config = fast().into_any();
     let plan = || Plan::new(&config, dataset).unwrap();
     let mut with = Trainer::begin(gpu, plan(), dataset, tuning(gpu), made_before(made)).unwrap();
     let mut without = Trainer::new(gpu, plan(), dataset, tuning(gpu)).unwrap();
-    let end = config.gaussians.iterations;
+    let end = config.gaussian_iterations();
     assert!(without.preparation().is_some(), "a fit from scratch prepares its Gaussians");
     // Where views were adjusted, other fits come first.
     if dataset.frames.iter().all(|frame| frame.contrast == 1.0) {
@@ -229,7 +231,7 @@ fn an_adjustment_brings_views_together() {
 fn views_that_agree_are_not_adjusted() {
     let gpu = gpu();
     let shot = Studio::new(&gpu, 100, 1).shoot(4, false, Wrong { seed: 11, ..Wrong::default() });
-    let calibration = calibrate(&shot.dataset, fast().calibration()).unwrap();
+    let calibration = calibrate(&shot.dataset, fast().into_any().calibration()).unwrap();
     let (after, made) = adjust(&gpu, &shot, &calibration);
     let record = after.adjustment.clone().unwrap();
     println!("{record:?}");
@@ -341,9 +343,9 @@ fn a_session_that_is_stopped_while_it_adjusts_keeps_its_reconstruction() {
 /// Settings of short fits, of which two views need several.
 fn short() -> Config {
     let mut config = fast();
-    config.calibrate.adjust = AdjustMode::Off;
+    config.adjustment.adjust = AdjustMode::Off;
     (config.gaussians.iterations, config.train.iterations) = (30, 40);
-    config
+    config.into_any()
 }
 
 fn of_two_views(gpu: &Gpu) -> Shot {
@@ -389,10 +391,10 @@ fn an_earlier_field_is_shown_until_the_first_of_several_fits_is_done() {
     let gpu = gpu();
     let shot = of_two_views(&gpu);
     let (dataset, config) = (&shot.dataset, short());
-    let mut alone = config.clone();
-    (alone.gaussians.fits, alone.seed) = (1, config.seed + 1);
+    let mut alone = config.fitted_once();
+    alone.seed += 1;
     let mut first = Trainer::new(&gpu, Plan::new(&alone, dataset).unwrap(), dataset, tuning(&gpu)).unwrap();
-    run(&mut first, config.gaussians.iterations);
+    run(&mut first, config.gaussian_iterations());
     let earlier = first.model().unwrap().gaussians.unwrap();
     drop(first);
     let kept = FitField::of_gaussians(earlier.clone());

@@ -382,6 +382,21 @@ fn a_method_is_named_by_few_files_outside_its_room() {
 }
 
 #[test]
+fn settings_of_a_method_name_no_other_method() {
+    for (method, _) in METHODS {
+        let own = format!("src/config/{method}.rs");
+        let uses = |line: &str| line.contains(&format!("::{method}")) || line.contains(&format!("mod {method};"));
+        let named: Vec<String> = files("src/config")
+            .into_iter()
+            .filter(|(path, text)| *path != own && code(text).any(uses))
+            .map(|(path, _)| path)
+            .filter(|path| !path.ends_with("/tests.rs"))
+            .collect();
+        assert!(named.is_empty(), "settings of {method} are named by {named:?}");
+    }
+}
+
+#[test]
 fn doc_comments_begin_with_a_verb_or_a_noun() {
     let fragment = |line: &str| {
         let text = line.trim_start();

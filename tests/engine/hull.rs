@@ -3,7 +3,6 @@
 use crate::common;
 use crate::common::{expect_silence, gpu, run, small_config, small_dataset, tuning};
 use glam::DVec3;
-use nertca_vk::config::{Config, Preset};
 use nertca_vk::fields::carve::carve;
 use nertca_vk::fields::motion;
 use nertca_vk::fields::scale::dynamic_half;
@@ -153,9 +152,8 @@ fn no_vessel_that_moves_is_carved_away() {
         let phantom = phantom(&gpu, views);
         let dataset = &phantom.dataset;
         let changes = changes(&gpu, &phantom);
-        let config = Config::load(Some(Preset::FastMlp), None, &[]).unwrap();
-        let motion = motion::analyse(dataset, &config.hull);
-        let half = dynamic_half(&config, dataset);
+        let motion = motion::analyse(dataset, motion::Thresholds::default());
+        let half = dynamic_half(0.0, dataset);
         for (per_phase, visible) in [(true, VISIBLE_AT_A_PHASE), (false, VISIBLE_OVER_THE_BEAT)] {
             let hull = carve(dataset, &motion, half, RESOLUTION, per_phase);
             let (shown, gone) = lost(&phantom, &changes, &hull, half, visible);
@@ -176,9 +174,8 @@ fn carving_by_exact_shadows_loses_nothing() {
     let gpu = gpu();
     let phantom = phantom(&gpu, 3);
     let dataset = &phantom.dataset;
-    let config = Config::load(Some(Preset::FastMlp), None, &[]).unwrap();
-    let half = dynamic_half(&config, dataset);
-    let mut motion = motion::analyse(dataset, &config.hull);
+    let half = dynamic_half(0.0, dataset);
+    let mut motion = motion::analyse(dataset, motion::Thresholds::default());
     for m in &mut motion {
         for (phase, moving) in m.moving_at.iter_mut().enumerate() {
             let frame = dataset.training().iter().find(|f| f.view == m.view && f.phase as usize == phase).unwrap();

@@ -70,7 +70,7 @@ fn rays_and_depths_match() {
     let plan = trainer.fields().unwrap().data();
     let got: Vec<Ray> = gpu.download(&trainer.fields().unwrap().forward().rays, 0, plan.setup.n_rays as usize).unwrap();
     let want = march::batch(plan, losses.last().unwrap().step - 1);
-    let params: Vec<f64> = plan.params.initial(&plan.config).iter().map(|v| f64::from(*v)).collect();
+    let params: Vec<f64> = plan.params.initial(plan.config.seed).iter().map(|v| f64::from(*v)).collect();
     let mut live = 0;
     for (g, w) in got.iter().zip(&want) {
         let [(nearest, _), (beyond, share)] = w.shown;
@@ -147,7 +147,7 @@ fn ten_updates_across_the_delay_match() {
         let settings =
             ["dynamic.delay=5", "dynamic.lr=1e-3", "dynamic.lr_end=1e-4", "adam.epsilon=1e-6", "loss.normalise=true"];
         let plan = Plan::new(&small_config(preset, &settings), &dataset).unwrap();
-        let mut params: Vec<f64> = plan.params.initial(&plan.config).iter().map(|v| f64::from(*v)).collect();
+        let mut params: Vec<f64> = plan.params.initial(plan.config.seed).iter().map(|v| f64::from(*v)).collect();
         let start = params.clone();
         let mut moments = vec![[0.0; 2]; params.len()];
         let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();

@@ -116,7 +116,7 @@ fn runs_learn_repeat_and_resume_bit_by_bit() {
     assert!(mean(&losses[100..]) < 0.3 * mean(&losses[..5]), "{:?} {:?}", &losses[..5], &losses[115..]);
     // Both fields learn, and rendering shows the trained parameters.
     let split = want.model.param_map.static_len;
-    let first = whole.plan().params.initial(&config);
+    let first = whole.plan().params.initial(config.seed);
     let moved = |range: std::ops::Range<usize>| range.filter(|i| want.model.params[*i] != first[*i]).count();
     assert!(moved(0..split) > split / 2 && moved(split..first.len()) > (first.len() - split) / 2);
     drop((whole, parts, resumed));

@@ -48,8 +48,8 @@ fn session(gpu: &Gpu, dataset: &Dataset) -> Session {
 
 fn session_of(gpu: &Gpu, dataset: &Dataset, form: GaussianForm, iterations: u32) -> Session {
     let mut config = Config::preset(Preset::Fast);
-    config.gaussians.form = form;
     config.train.iterations = iterations;
+    config = config.with(&[format!("gaussians.form={}", form.name())]).unwrap();
     let options = SessionOptions {
         config,
         phases: PHASES,

@@ -86,7 +86,7 @@ fn every_preset_trains_past_the_last_event_of_its_schedule() {
             _ => vec!["march.dynamic_samples=32", "march.static_samples=32", "dynamic.width=16"],
         });
         let settings: Vec<String> = settings.into_iter().map(String::from).collect();
-        let mut config = Config::load(Some(*preset), None, &settings).unwrap().of_dry_run().unwrap();
+        let mut config = Config::load(Some(*preset), None, &settings).unwrap().of_dry_run();
         let last = *config.schedule_events().last().unwrap();
         config.train.iterations = config.train.iterations.max(last + AFTER);
         let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();

@@ -26,8 +26,7 @@ fn a_session_fits_as_a_run_with_the_same_prior() {
         gaussians.unwrap()
     };
     let of_run = |prior: VesselPrior| -> GaussianField {
-        let mut config = Config::preset(Preset::Fast);
-        config.gaussians.fits = 1;
+        let config = Config::load(Some(Preset::Fast), None, &["gaussians.fits=1".into()]).unwrap();
         let mut dataset = shot.dataset.clone();
         dataset.prior = Some(Arc::new(prior));
         let dataset = dataset.corrected(&calibrate(&dataset, config.calibration()).unwrap()).unwrap();

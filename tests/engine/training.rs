@@ -121,7 +121,6 @@ fn a_cancelled_run_is_saved_and_a_diverging_one_keeps_its_checkpoint() {
             "train.checkpoint_every=1",
             "static.lr=100",
             "static.lr_end=100",
-            "static.init_std=3",
             "train.stop_at_loss_ratio=1e6",
         ],
     );

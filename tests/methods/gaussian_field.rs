@@ -4,7 +4,8 @@ use crate::common;
 use crate::common::{expect_agreement, expect_silence, gpu, phantom, run, tuning};
 use glam::DVec3;
 use nertca_vk::checkpoint::{self, Checkpoint};
-use nertca_vk::config::{AdjustMode, Config, Preset, sections};
+use nertca_vk::config::sections::GaussiansSettings;
+use nertca_vk::config::{AdjustMode, Config, Preset};
 use nertca_vk::error::Error;
 use nertca_vk::fields::state::FieldsState;
 use nertca_vk::gaussians::field::{GaussianField, Gaussians, MovingGaussians};
@@ -21,7 +22,7 @@ use nertca_vk::train::trainer::Trainer;
 use nertca_vk_runs::run::events::Event;
 use nertca_vk_runs::run::reconstruct::{RunOptions, reconstruct};
 use nertca_vk_twins::selftest::blobs;
-use nertca_vk_twins::selftest::problems::drawn_fields;
+use nertca_vk_twins::selftest::problems::{drawn_fields, with_values};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -154,7 +155,7 @@ fn damaged_gaussians_are_refused_by_name() {
 }
 
 /// A run short enough for tests: 20 iterations of Gaussians, 12 of the static field.
-fn short_run(form: &str) -> Config {
+fn short_run(form: &str) -> Config<GaussiansSettings> {
     let settings = [
         "train.iterations=32",
         "train.checkpoint_every=1000",
@@ -163,14 +164,13 @@ fn short_run(form: &str) -> Config {
         "gaussians.grow_at=10",
         "gaussians.clear_at=14",
         "gaussians.count=120",
-        "tree.warm_iterations=12",
-        "tree.track_iterations=4",
+        "deformable.warm_iterations=12",
+        "deformable.track_iterations=4",
         // With the preset's smoothness, the static field learns too little to be visible in so few iterations.
         "static.tv=1",
     ];
-    let mut all: Vec<String> = settings.map(String::from).to_vec();
-    all.push(format!("gaussians.form={form}"));
-    Config::preset(Preset::Fast).with_constants(&all).unwrap()
+    let form = format!("gaussians.form={form}");
+    with_values(&Config::preset(Preset::Fast), settings.into_iter().chain([form.as_str()])).unwrap().of().unwrap()
 }
 
 #[test]
@@ -182,11 +182,12 @@ fn resume_equals_no_interruption() {
     let (off, auto) = (AdjustMode::Off, AdjustMode::Auto);
     for (form, fits, adjust) in [("phase", 1, off), ("tree", 1, off), ("tree", 2, off), ("tree", 1, auto)] {
         let mut config = short_run(form);
-        (config.gaussians.fits, config.calibrate.adjust) = (fits, adjust);
+        (config.gaussians.fits, config.adjustment.adjust) = (fits, adjust);
         let go = |name: &str, resume: bool, stop: Option<&dyn Fn(&Event) -> bool>| {
             let path = directory.path().join(format!("{form}-{fits}-{adjust:?}-{name}"));
             let cancel = AtomicBool::new(false);
             let options = RunOptions { tuning: &tuning(&gpu), run: &path, resume, stop_at: None, cancel: &cancel };
+            let config = config.clone().into_any();
             let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut |event| {
                 if stop.is_some_and(|stop| stop(event)) {
                     cancel.store(true, Ordering::Relaxed);
@@ -225,13 +226,10 @@ fn the_still_field_learns_what_gaussians_leave() {
     let gpu = gpu();
     let directory = tempfile::tempdir().unwrap();
     let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
-    let config = short_run("phase");
-    let config = Config {
-        train: sections::Train { iterations: 160, ..config.train },
-        // After so few iterations, vessels are not dense yet.
-        gaussians: sections::Gaussians { clear_at: 0, ..config.gaussians },
-        ..config
-    };
+    let mut config = short_run("phase");
+    // After so few iterations, vessels are not dense yet.
+    (config.train.iterations, config.gaussians.clear_at) = (160, 0);
+    let config = config.into_any();
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     let losses = run(&mut trainer, 160);
     assert_eq!(losses.len(), 160);
@@ -255,7 +253,7 @@ fn other_images_begin_the_fit_anew_and_keep_device_and_host_in_step() {
     let gpu = gpu();
     let directory = tempfile::tempdir().unwrap();
     let mut dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
-    let config = short_run("phase");
+    let config = short_run("phase").into_any();
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     run(&mut trainer, 32);
     let saved = trainer.checkpoint().unwrap();
@@ -283,6 +281,7 @@ fn the_mean_of_fits_holds_all_of_them_and_their_agreement() {
     let field = |form: &str, seed: u32, fits: u32| {
         let mut config = short_run(form);
         (config.seed, config.gaussians.fits, config.train.iterations) = (seed, fits, 21);
+        let config = config.into_any();
         let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
         let losses = run(&mut trainer, 21);
         assert_eq!(losses.len(), 21, "the iterations of the last fit, and one of the static field");

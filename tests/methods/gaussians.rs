@@ -4,8 +4,6 @@ use crate::common;
 use crate::common::{drop_first_view, expect_agreement, expect_silence, gpu, phantom, relative_error};
 use crate::golden_file::Golden;
 use glam::DVec3;
-use nertca_vk::config::sections;
-use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Result;
 use nertca_vk::gaussians::field::{Gaussians, MovingGaussians};
 use nertca_vk::gaussians::particles::Particles;
@@ -14,6 +12,7 @@ use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::{Gaussian, GaussianSetup};
 use nertca_vk::methods::dynamic_gaussians::deformable::{DeformableTrainer, Earlier};
 use nertca_vk::methods::dynamic_gaussians::per_phase::GaussianTrainer;
+use nertca_vk::methods::dynamic_gaussians::rules::{GaussianRules, Rules};
 use nertca_vk::methods::dynamic_gaussians::setup;
 use nertca_vk::methods::dynamic_gaussians::shared_images::SharedImages;
 use nertca_vk::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
@@ -25,15 +24,20 @@ use nertca_vk_twins::reference::maxima::maxima;
 use nertca_vk_twins::selftest::dynamic_gaussians;
 use nertca_vk_twins::selftest::gaussians::{self, TENSORS, device_gradient, numbers, twin};
 use nertca_vk_twins::selftest::problems::{
-    self, ANGLES_DEG, deformable_case, fillings, moving_set, random_gaussians, units, with_gaussians,
+    self, ANGLES_DEG, deformable_case, fillings, moving_set, random_gaussians, units,
 };
 use nertca_vk_vessels::score::metrics;
 use nertca_vk_vessels::vessels::threshold::VESSEL_SHARE;
 use std::time::Instant;
 
-/// The default configuration.
-fn config() -> Config {
-    Config::preset(Preset::Fast)
+/// The default fit.
+fn config() -> Rules {
+    problems::default_rules().unwrap()
+}
+
+/// The default fit with other Gaussians.
+fn with_gaussians(gaussians: GaussianRules) -> Rules {
+    Rules { gaussians, ..config() }
 }
 
 fn targets(width: usize, height: usize, n_phases: usize) -> Targets {
@@ -135,7 +139,7 @@ fn runs_repeat_bit_by_bit() {
     let gpu = gpu();
     let (targets, rows) = hard_case();
     let train = |stops: &[u32]| {
-        let config = with_gaussians(sections::Gaussians { iterations: 30, grow_at: 0, ..config().gaussians });
+        let config = with_gaussians(GaussianRules { iterations: 30, grow_at: 0, ..config().gaussians });
         let particles = Particles::fresh(rows.clone());
         let mut trainer = GaussianTrainer::with(&gpu, targets.clone(), &config, &particles).unwrap();
         let mut losses = Vec::new();
@@ -207,7 +211,7 @@ fn golden_values_of_pytorch() {
     let golden = Golden::open("gaussians", "tools/reference_gaussians.py");
     let (targets, rows) = (golden.targets(), golden.gaussians("start"));
     let iterations = golden.size("iterations") as u32;
-    let config = with_gaussians(sections::Gaussians { iterations, grow_at: 0, ..config().gaussians });
+    let config = with_gaussians(GaussianRules { iterations, grow_at: 0, ..config().gaussians });
     let mut trainer = GaussianTrainer::with(&gpu, targets.clone(), &config, &Particles::fresh(rows.clone())).unwrap();
     let (images, loss, gradient) = twin(&targets, trainer.setup(), &with_phases(&rows));
     let want_loss = golden.get("loss")[0];
@@ -272,7 +276,7 @@ fn impossible_runs_are_refused_in_words() {
 }
 
 /// Runs a complete fit with the settings.
-fn fit_of(gpu: &Gpu, dataset: &Dataset, config: &Config, form: Train) -> Result<Gaussians> {
+fn fit_of(gpu: &Gpu, dataset: &Dataset, config: &Rules, form: Train) -> Result<Gaussians> {
     let targets = Targets::new(dataset, &SoftMotion::new(dataset, 0.3, 32), &config.gaussians)?;
     form(gpu, targets, config)
 }
@@ -285,10 +289,10 @@ fn check_finite(model: &Gaussians, what: &str) {
 #[test]
 fn degenerate_data_are_fitted_or_refused_in_words() {
     let gpu = gpu();
-    let config = with_gaussians(sections::Gaussians { iterations: 60, count: 40, ..config().gaussians });
+    let config = with_gaussians(GaussianRules { iterations: 60, count: 40, ..config().gaussians });
     let all = common::small_dataset(32, 32);
     for (name, form) in FORMS {
-        let refused = |dataset: &Dataset, config: &Config, part: &str| {
+        let refused = |dataset: &Dataset, config: &Rules, part: &str| {
             let fault =
                 fit_of(&gpu, dataset, config, form).err().unwrap_or_else(|| panic!("{name}: {part}")).to_string();
             assert!(fault.contains(part), "{name}: {fault}");
@@ -314,7 +318,7 @@ fn degenerate_data_are_fitted_or_refused_in_words() {
         broken.frames[0].integrals[5] = f32::NAN;
         let view = broken.frames[0].view;
         refused(&broken, &config, &format!("view {view}"));
-        let none = with_gaussians(sections::Gaussians { prune_threshold: 1e3, ..config.gaussians.clone() });
+        let none = with_gaussians(GaussianRules { prune_threshold: 1e3, ..config.gaussians.clone() });
         refused(&all, &none, "gaussians.prune_threshold");
     }
     expect_silence(gpu);
@@ -327,7 +331,7 @@ fn targets_of(dataset: &Dataset) -> Targets {
     Targets::new(dataset, &SoftMotion::new(dataset, HALF, 112), &config().gaussians).unwrap()
 }
 
-fn train_phases(gpu: &Gpu, targets: Targets, config: &Config) -> Result<Gaussians> {
+fn train_phases(gpu: &Gpu, targets: Targets, config: &Rules) -> Result<Gaussians> {
     let until = config.gaussians.iterations;
     let mut trainer = GaussianTrainer::new(gpu, targets, config)?;
     while trainer.step() < until {
@@ -336,7 +340,7 @@ fn train_phases(gpu: &Gpu, targets: Targets, config: &Config) -> Result<Gaussian
     trainer.model()
 }
 
-fn train_tree(gpu: &Gpu, targets: Targets, config: &Config) -> Result<Gaussians> {
+fn train_tree(gpu: &Gpu, targets: Targets, config: &Rules) -> Result<Gaussians> {
     let until = config.gaussians.iterations;
     let mut trainer = DeformableTrainer::new(gpu, targets, config)?;
     while trainer.step() < until {
@@ -351,7 +355,7 @@ fn a_reseeded_fit_moves_as_the_earlier_one_and_has_gaussians_of_its_own() {
     let gpu = gpu();
     let directory = tempfile::tempdir().unwrap();
     let dataset = phantom(&gpu, directory.path(), 40, 4);
-    let config = with_gaussians(sections::Gaussians { iterations: 30, ..config().gaussians });
+    let config = with_gaussians(GaussianRules { iterations: 30, ..config().gaussians });
     let fitted = |trainer: &mut DeformableTrainer| {
         let mut losses = Vec::new();
         while trainer.step() < config.gaussians.iterations {
@@ -362,7 +366,7 @@ fn a_reseeded_fit_moves_as_the_earlier_one_and_has_gaussians_of_its_own() {
     let mut first = DeformableTrainer::new(&gpu, targets_of(&dataset), &config).unwrap();
     fitted(&mut first);
     let earlier = first.deformable().unwrap();
-    let other = Config { seed: config.seed + 1, ..config.clone() };
+    let other = Rules { seed: config.seed + 1, ..config.clone() };
     let from = Earlier { field: &earlier, step: 0, reseeds: true };
     let mut second = DeformableTrainer::after(&gpu, targets_of(&dataset), &other, from).unwrap();
     let seeded = second.deformable().unwrap();
@@ -405,7 +409,7 @@ const PHASE_DICE: [f64; 2] = [0.82, 0.73];
 /// Minimum Dice of a tree; measured 0.846 and 0.813, at least 0.853 and 0.775 with two other seeds.
 const TREE_DICE: [f64; 2] = [0.82, 0.74];
 
-type Train = fn(&Gpu, Targets, &Config) -> Result<Gaussians>;
+type Train = fn(&Gpu, Targets, &Rules) -> Result<Gaussians>;
 const FORMS: [(&str, Train); 2] = [("phase", train_phases), ("tree", train_tree)];
 
 /// The true volume scores 0.905 by this rule.
@@ -464,7 +468,7 @@ fn maxima_are_those_of_the_field() {
 
 #[test]
 fn tree_twin_gradient_is_the_derivative_of_its_loss() {
-    let (targets, rows, Config { deformable: settings, .. }) = deformable_case().unwrap();
+    let (targets, rows, Rules { deformable: settings, .. }) = deformable_case().unwrap();
     let setup = GaussianSetup { cut: 12.0, ..setup::gaussian_setup(&targets, &config().gaussians) };
     let tree = setup::deformable_setup(&targets, &settings);
     let mut p = moving_set(&rows[..7], &tree, targets.n_phases);

@@ -9,6 +9,7 @@ use crate::golden_file::Golden;
 use crate::one_phase::dataset;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use nertca_vk::checkpoint::Checkpoint;
+use nertca_vk::config::sections::R2Settings;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
 use nertca_vk::fitting::shown::SetsFit;
@@ -36,7 +37,7 @@ use nertca_vk_twins::selftest::r2_gaussian::{compare, hard_case, small_config, t
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-fn config(settings: &[&str]) -> Config {
+fn config(settings: &[&str]) -> Config<R2Settings> {
     small_config(settings).unwrap()
 }
 
@@ -58,7 +59,7 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     }
 }
 
-fn expect_derivatives(config: &Config) {
+fn expect_derivatives(config: &Config<R2Settings>) {
     let gpu = gpu();
     let (data, rows) = hard_case(config).unwrap();
     let fit = R2Trainer::with(&gpu, data, config, &R2State::fresh(rows.clone()), 0).unwrap();
@@ -164,8 +165,8 @@ fn state_of(checkpoint: &Checkpoint) -> R2State {
     checkpoint.state::<R2State>().unwrap().clone()
 }
 
-fn data_of(dataset: &Dataset, config: &Config) -> R2Data {
-    Plan::new(config, dataset).unwrap().data::<R2Data>().unwrap().clone()
+fn data_of(dataset: &Dataset, config: &Config<R2Settings>) -> R2Data {
+    Plan::new(&config.clone().into_any(), dataset).unwrap().data::<R2Data>().unwrap().clone()
 }
 
 #[test]
@@ -249,7 +250,7 @@ fn expect_golden(file: &str, integral: &str) {
 const SIDES: &[[f64; 2]] = &[[-30.0, 25.0], [60.0, -20.0], [5.0, 8.0]];
 
 /// A few round Gaussians in a volume of 20 mm, and exact images of them.
-fn phantom_of_gaussians(settings: &[&str]) -> (Dataset, Config, Vec<R2Gaussian>) {
+fn phantom_of_gaussians(settings: &[&str]) -> (Dataset, Config<R2Settings>, Vec<R2Gaussian>) {
     let all = [&["r2.half_extent_mm=20", "r2.normalise=false", "train.iterations=300"], settings].concat();
     let config = config(&all);
     let bounds = ScaleBounds::of(&config.r2);
@@ -279,7 +280,8 @@ fn gaussians_are_seen_and_drawn_as_the_closed_form_has_them() {
     let gpu = gpu();
     let (dataset, config, rows) = phantom_of_gaussians(&[]);
     let peak = dataset.frames[0].integrals.iter().fold(0f32, |m, v| m.max(*v));
-    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    let mut trainer =
+        Trainer::new(&gpu, Plan::new(&config.clone().into_any(), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     let mut saved = trainer.checkpoint().unwrap();
     let fit = R2Trainer::with(&gpu, data_of(&dataset, &config), &config, &R2State::fresh(rows), 0).unwrap();
     saved.model.gaussians = Some(GaussianField::PerPhase(fit.model().unwrap()));
@@ -315,7 +317,8 @@ fn a_fit_finds_what_gaussians_can_show() {
         "r2.scaling_lr_init=0.02",
         "r2.lambda_tv=0",
     ]);
-    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    let mut trainer =
+        Trainer::new(&gpu, Plan::new(&config.clone().into_any(), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     let losses = run(&mut trainer, 300);
     let mean = |l: &[f64]| l.iter().sum::<f64>() / l.len() as f64;
     let (first, last) = (mean(&losses[..9]), mean(&losses[291..]));
@@ -353,7 +356,7 @@ fn clones_show_the_same_picture_and_split_ones_another() {
 }
 
 /// A short configuration with strong effects of density control.
-fn short(static_data: &str) -> Config {
+fn short(static_data: &str) -> Config<R2Settings> {
     let data = format!("r2.static_data={static_data}");
     config(&[
         &data,
@@ -367,8 +370,8 @@ fn short(static_data: &str) -> Config {
     ])
 }
 
-fn start(gpu: &Gpu, config: &Config, dataset: &Dataset) -> Trainer {
-    Trainer::new(gpu, Plan::new(config, dataset).unwrap(), dataset, tuning(gpu)).unwrap()
+fn start(gpu: &Gpu, config: &Config<R2Settings>, dataset: &Dataset) -> Trainer {
+    Trainer::new(gpu, Plan::new(&config.clone().into_any(), dataset).unwrap(), dataset, tuning(gpu)).unwrap()
 }
 
 #[test]
@@ -386,7 +389,7 @@ fn runs_repeat_and_resume_bit_by_bit_across_density_control() {
             let saved = parts.checkpoint().unwrap();
             let read = Checkpoint::from_bytes(&saved.to_bytes().unwrap(), "checkpoint".as_ref()).unwrap();
             assert_eq!((state_of(&read), &read.model.gaussians), (state_of(&saved), &saved.model.gaussians));
-            let plan = Plan::new(&config, &dataset).unwrap().in_scene(read.model.scene.clone());
+            let plan = Plan::new(&config.clone().into_any(), &dataset).unwrap().in_scene(read.model.scene.clone());
             let mut resumed = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &read).unwrap();
             assert_eq!(resumed.step(), stop);
             again.extend(run(&mut resumed, 60));
@@ -485,7 +488,7 @@ fn a_start_without_candidates_is_said() {
 fn what_cannot_be_fitted_is_refused() {
     let gpu = gpu();
     let mut dataset = small_dataset(13, 11);
-    let refused = |dataset: &Dataset| match Plan::new(&config(&[]), dataset).map(|_| ()) {
+    let refused = |dataset: &Dataset| match Plan::new(&config(&[]).into_any(), dataset).map(|_| ()) {
         Err(Error::Config { problem, .. } | Error::Unmet { problem, .. }) => problem,
         other => panic!("{other:?}"),
     };

@@ -6,7 +6,7 @@ use crate::common::{
 };
 use crate::golden_file::Golden;
 use nertca_vk::checkpoint::Checkpoint;
-use nertca_vk::config::method::MethodKind;
+use nertca_vk::config::sections::SaxSettings;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
 use nertca_vk::fitting::sets::seed_of_set;
@@ -30,7 +30,7 @@ use nertca_vk_twins::selftest::sax_nerf::{compare, f64s, hard_case, small_config
 use std::collections::HashSet;
 use std::sync::Arc;
 
-fn config(settings: &[&str]) -> Config {
+fn config(settings: &[&str]) -> Config<SaxSettings> {
     small_config(settings).unwrap()
 }
 
@@ -282,8 +282,8 @@ fn change_field(checkpoint: &mut Checkpoint, change: impl FnOnce(&mut SaxField))
     checkpoint.model.field = Some(Arc::new(field));
 }
 
-fn start(gpu: &Gpu, config: &Config, dataset: &Dataset) -> Trainer {
-    Trainer::new(gpu, Plan::new(config, dataset).unwrap(), dataset, tuning(gpu)).unwrap()
+fn start(gpu: &Gpu, config: &Config<SaxSettings>, dataset: &Dataset) -> Trainer {
+    Trainer::new(gpu, Plan::new(&config.clone().into_any(), dataset).unwrap(), dataset, tuning(gpu)).unwrap()
 }
 
 #[test]
@@ -305,7 +305,7 @@ fn runs_fit_their_images_and_repeat_and_resume_bit_by_bit() {
         let saved = parts.checkpoint().unwrap();
         let read = Checkpoint::from_bytes(&saved.to_bytes().unwrap(), "checkpoint".as_ref()).unwrap();
         assert_eq!((state_of(&read), field_of(&read.model)), (state_of(&saved), field_of(&saved.model)));
-        let plan = Plan::new(&config, &dataset).unwrap().in_scene(read.model.scene.clone());
+        let plan = Plan::new(&config.clone().into_any(), &dataset).unwrap().in_scene(read.model.scene.clone());
         let mut resumed = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &read).unwrap();
         assert_eq!(resumed.step(), stop);
         again.extend(run(&mut resumed, 24));
@@ -395,12 +395,13 @@ fn a_model_is_drawn_sampled_and_baked_at_whole_phases() {
 fn what_cannot_be_fitted_is_refused() {
     let gpu = gpu();
     let mut dataset = small_dataset(13, 11);
-    let refused = |dataset: &Dataset, settings: &[&str]| match Plan::new(&config(settings), dataset).map(|_| ()) {
-        Err(Error::Config { problem, field, .. } | Error::Unmet { problem, field, .. }) => {
-            format!("{field}: {problem}")
-        }
-        other => panic!("{other:?}"),
-    };
+    let refused =
+        |dataset: &Dataset, settings: &[&str]| match Plan::new(&config(settings).into_any(), dataset).map(|_| ()) {
+            Err(Error::Config { problem, field, .. } | Error::Unmet { problem, field, .. }) => {
+                format!("{field}: {problem}")
+            }
+            other => panic!("{other:?}"),
+        };
     let problem = refused(&dataset, &["sax.window_size=6", "sax.window_num=3"]);
     assert!(problem.contains("sax.window_num") && problem.contains("room for at most 2 windows"), "{problem}");
     dataset.frames[2].integrals[15] = f32::NAN;
@@ -414,7 +415,7 @@ fn what_cannot_be_fitted_is_refused() {
     if largest < 1 << 30 {
         let too_large = |settings: &[&str]| {
             let config = config(settings);
-            let plan = Plan::new(&config, &dataset).unwrap();
+            let plan = Plan::new(&config.clone().into_any(), &dataset).unwrap();
             Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).map(|_| ()).unwrap_err().to_string()
         };
         let error = too_large(&["sax.num_levels=16", "sax.base_resolution=16", "sax.log2_hashmap_size=22"]);
@@ -433,7 +434,7 @@ fn what_cannot_be_fitted_is_refused() {
         Checkpoint::from_bytes(&other.to_bytes().unwrap(), "checkpoint".as_ref()).err().map(|e| e.to_string())
     };
     assert_eq!(damaged(&|_| ()), None);
-    let grid = SaxShape::of(&saved.model.config.sax).n_weights();
+    let grid = SaxShape::of(&saved.model.config.of::<SaxSettings>().unwrap().sax).n_weights();
     assert!(damaged(&|c| change_field(c, |field| field.params[1][grid] = f32::NAN)).unwrap().contains("sax.grid"));
     assert!(
         damaged(&|c| {
@@ -445,10 +446,14 @@ fn what_cannot_be_fitted_is_refused() {
         .contains("sax.adam.v.norm1")
     );
     assert!(damaged(&|c| change_field(c, |field| field.bound = -1.0)).unwrap().contains("must be positive"));
-    assert!(damaged(&|c| c.model.config.sax.levels = 4).unwrap().contains("sax.grid"));
+    assert!(
+        damaged(&|c| c.model.config = c.model.config.with(&["sax.num_levels=4".into()]).unwrap())
+            .unwrap()
+            .contains("sax.grid")
+    );
     let other = SaxState { moments: state_of(&saved).moments[..2].to_vec() };
     let (field, config) = (field_of(&saved.model), config(&[]));
-    let data = Plan::new(&config, &dataset).unwrap().data::<SaxData>().unwrap().clone();
+    let data = Plan::new(&config.clone().into_any(), &dataset).unwrap().data::<SaxData>().unwrap().clone();
     let error = SaxTrainer::with(&gpu, data, &config, &field, &other).map(|_| ()).unwrap_err().to_string();
     assert!(error.contains("checkpoint"), "{error}");
     expect_silence(gpu);
@@ -458,7 +463,7 @@ fn what_cannot_be_fitted_is_refused() {
 fn presets_and_notes_say_what_the_method_is() {
     let config = Config::preset(Preset::SaxNerf);
     assert_eq!((config.gaussian_iterations(), config.train.iterations), (0, 4503));
-    assert!(config.method() == MethodKind::SaxNerf && !config.method().has_network() && !config.follows_breath());
+    assert!(config.fields().is_none() && !config.has_network() && !config.follows_breath());
     let plan = Plan::new(&config, &uneven_dataset(64, 48)).unwrap();
     let says = |part: &str| assert!(plan.notes.iter().any(|note| note.contains(part)), "{part}: {:?}", plan.notes);
     says("a static method");

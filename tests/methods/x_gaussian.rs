@@ -8,6 +8,7 @@ use crate::common::{
 use crate::golden_file::Golden;
 use crate::one_phase::dataset;
 use nertca_vk::checkpoint::Checkpoint;
+use nertca_vk::config::sections::XSettings;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
 use nertca_vk::fitting::shown::SetsFit;
@@ -27,7 +28,7 @@ use nertca_vk_twins::reference::x_gaussian::{N_PARAMS, Params, params};
 use nertca_vk_twins::selftest::x_gaussian::{TENSORS, compare, hard_case, numbers, small_config, twin, with_sets};
 use std::sync::Arc;
 
-fn config(settings: &[&str]) -> Config {
+fn config(settings: &[&str]) -> Config<XSettings> {
     small_config(settings).unwrap()
 }
 
@@ -78,8 +79,8 @@ fn state_of(checkpoint: &Checkpoint) -> XState {
     checkpoint.state::<XState>().unwrap().clone()
 }
 
-fn data_of(dataset: &Dataset, config: &Config) -> XData {
-    Plan::new(config, dataset).unwrap().data::<XData>().unwrap().clone()
+fn data_of(dataset: &Dataset, config: &Config<XSettings>) -> XData {
+    Plan::new(&config.clone().into_any(), dataset).unwrap().data::<XData>().unwrap().clone()
 }
 
 #[test]
@@ -149,8 +150,8 @@ fn golden_values_of_pytorch() {
     expect_silence(gpu);
 }
 
-fn start(gpu: &Gpu, config: &Config, dataset: &Dataset) -> Trainer {
-    Trainer::new(gpu, Plan::new(config, dataset).unwrap(), dataset, tuning(gpu)).unwrap()
+fn start(gpu: &Gpu, config: &Config<XSettings>, dataset: &Dataset) -> Trainer {
+    Trainer::new(gpu, Plan::new(&config.clone().into_any(), dataset).unwrap(), dataset, tuning(gpu)).unwrap()
 }
 
 const SIDES: &[[f64; 2]] = &[[-30.0, 25.0], [60.0, -20.0], [5.0, 8.0]];
@@ -226,7 +227,7 @@ fn a_fit_shows_discs_that_hide_each_other_and_models_draw_what_fits_see() {
 }
 
 /// A short configuration with strong effects of density control and with a reset.
-fn short(static_data: &str) -> Config {
+fn short(static_data: &str) -> Config<XSettings> {
     let data = format!("x.static_data={static_data}");
     config(&[
         &data,
@@ -255,7 +256,7 @@ fn runs_repeat_and_resume_bit_by_bit_across_density_control() {
             let saved = parts.checkpoint().unwrap();
             let read = Checkpoint::from_bytes(&saved.to_bytes().unwrap(), "checkpoint".as_ref()).unwrap();
             assert_eq!((state_of(&read), &read.model.gaussians), (state_of(&saved), &saved.model.gaussians));
-            let plan = Plan::new(&config, &dataset).unwrap().in_scene(read.model.scene.clone());
+            let plan = Plan::new(&config.clone().into_any(), &dataset).unwrap().in_scene(read.model.scene.clone());
             let mut resumed = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &read).unwrap();
             assert_eq!(resumed.step(), stop);
             again.extend(run(&mut resumed, 60));
@@ -369,7 +370,7 @@ fn clones_and_children_show_more() {
 fn what_cannot_be_fitted_is_refused() {
     let gpu = gpu();
     let mut dataset = small_dataset(21, 18);
-    let refused = |dataset: &Dataset| match Plan::new(&config(&[]), dataset).map(|_| ()) {
+    let refused = |dataset: &Dataset| match Plan::new(&config(&[]).into_any(), dataset).map(|_| ()) {
         Err(Error::Config { problem, .. } | Error::Unmet { problem, .. }) => problem,
         other => panic!("{other:?}"),
     };
@@ -381,7 +382,7 @@ fn what_cannot_be_fitted_is_refused() {
     assert!(refused(&sizes).contains("images of equal size"));
     let one = of_one_view(&small_dataset(21, 18));
     assert!(refused(&one).contains("the same source position"), "{}", refused(&one));
-    assert!(Plan::new(&config(&["x.extent_mm=400"]), &one).is_ok());
+    assert!(Plan::new(&config(&["x.extent_mm=400"]).into_any(), &one).is_ok());
     // A damaged checkpoint is refused.
     let saved = start(&gpu, &config(&[]), &small_dataset(21, 18)).checkpoint().unwrap();
     let damaged = |damage: &dyn Fn(&mut XState)| {
@@ -427,6 +428,6 @@ fn presets_and_notes_say_what_the_method_is() {
     says("a static method");
     says("are used as frames of the nearest phase");
     says("exceed x.clamp = 1");
-    let data = data_of(&dataset, &config);
+    let data = data_of(&dataset, &config.of().unwrap());
     assert!(data.images.iter().all(|v| (0.0..=1.0).contains(v)) && data.images.contains(&1.0));
 }

@@ -275,12 +275,7 @@ fn is_of_the_paper(config: &Config) -> bool {
     }
     let mut same = Config::preset(config.preset);
     same.seed = config.seed;
-    same.train = Train {
-        iterations: same.train.iterations,
-        rays: same.train.rays,
-        motion_share: same.train.motion_share,
-        ..config.train.clone()
-    };
+    same.train = Train { iterations: same.train.iterations, ..config.train.clone() };
     same == *config
 }
 
@@ -304,7 +299,7 @@ fn internal(error: serde_json::Error) -> Error {
 
 /// Times a run whose dynamic field is a network, or whose method has its own module.
 fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<Timings> {
-    let delay = config.dynamic.delay.min(config.train.iterations);
+    let delay = config.fields().map_or(0, |settings| settings.dynamic.delay).min(config.train.iterations);
     let before = match delay {
         0 => None,
         _ => Some(Subject::new(gpu, config, dataset, tuning, false)?.time(&args.pace())?),
@@ -317,8 +312,8 @@ fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset,
     Ok(Timings {
         paths: subject.notes(),
         rays: (methods::of(config).rays_per_iteration)(config),
-        network_cost: config.method().has_network().then(|| subject.cost()),
-        work: if config.method().has_network() { subject.work(after.live_samples) } else { Ledger::new() },
+        network_cost: config.has_network().then(|| subject.cost()),
+        work: if config.has_network() { subject.work(after.live_samples) } else { Ledger::new() },
         gaussians: None,
         before,
         after: Some(after),
@@ -336,7 +331,7 @@ fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Datase
     let notes = fits.notes().to_vec();
     drop(fits);
     let whole_fit_s = |iterations: u32| gaussians.preparation_s + 1e-3 * gaussians.median() * f64::from(iterations);
-    if config.method().is_alone() {
+    if config.fields().is_none() {
         return Ok(Timings {
             paths: notes,
             rays: 0,

@@ -41,7 +41,7 @@ impl GlobalOptions {
     /// Returns the tuning of [`Self::tuning`], after timing both paths of the layers if they have not been timed yet.
     pub fn training_tuning(&self, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<Tuning> {
         let tuning = Tuning::for_device(gpu.info());
-        let either = self.layers.is_none() && Tuning::has_choice(gpu.info()) && config.method().has_network();
+        let either = self.layers.is_none() && Tuning::has_choice(gpu.info()) && config.has_network();
         let cache = cache_dir().filter(|_| either);
         let Some(cache) = cache.filter(|cache| calibrate::recall(cache, gpu.info(), config).is_none()) else {
             return Ok(self.tuning(gpu, config));

@@ -55,7 +55,7 @@ pub fn run(global: &GlobalOptions, args: &KernelsArgs) -> Result<()> {
     let answer = Answer {
         device: info.name.clone(),
         driver: info.driver.clone(),
-        paths: tuning.for_network(config.method().has_network()).reasons,
+        paths: tuning.for_network(config.has_network()).reasons,
         preset: config.preset.name().to_owned(),
         kernels,
     };

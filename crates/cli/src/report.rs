@@ -125,7 +125,10 @@ impl Report<'_> {
                 model.step, model.config.train.iterations
             ));
         }
-        if model.config.hull.enabled && model.hull.is_none() && model.gaussians.is_none() {
+        if model.config.fields().is_some_and(|settings| settings.has_hull)
+            && model.hull.is_none()
+            && model.gaussians.is_none()
+        {
             warnings.push(
                 "No motion hull was used: the views may disagree, or there is motion in too much of the images."
                     .to_owned(),
@@ -187,7 +190,7 @@ fn gaussians_of(field: &GaussianField) -> String {
         format!(", the mean of several fits; {percent:.0} % of the vessels of one fit lie in those of another")
     });
     let (n, name) = (field.rows().rows.len(), field.form());
-    format!("{n}, {form} (gaussians.form = \"{name}\"), {kib:.0} KiB{agreement}")
+    format!("{n}, {form} (form \"{name}\"), {kib:.0} KiB{agreement}")
 }
 
 fn images_of(dataset: &Dataset) -> String {

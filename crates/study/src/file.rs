@@ -7,7 +7,7 @@ use crate::published::Published;
 use crate::scores::Score;
 use crate::text::{Places, Text};
 use nertca_vk::choice::Choice;
-use nertca_vk::config::{Config, Preset, renamed};
+use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use serde::Deserialize;
@@ -221,7 +221,7 @@ fn configuration(
     let mut given: Vec<String> = Vec::new();
     for setting in section.set.iter().chain(further) {
         let fault = |problem: String| text.fault(&setting.span(), format!("method `{name}`: {problem}"));
-        let key = renamed::current(setting.get_ref().split('=').next().unwrap_or_default().trim());
+        let key = setting.get_ref().split('=').next().unwrap_or_default().trim().to_owned();
         if let Some((_, owner)) = OWNED.iter().find(|(owned, _)| *owned == key) {
             return Err(fault(format!("`{key}` is set by {owner}")));
         }
@@ -235,8 +235,9 @@ fn configuration(
     }
     let own = || section.set.iter().chain(further);
     let settings: Vec<String> = own().map(|setting| setting.get_ref().clone()).collect();
-    let schedule = section.iterations.as_ref().map(|iterations| scaled(preset, *iterations.get_ref(), &given));
-    Config::preset(section.preset).with_both(&settings, &schedule.unwrap_or_default()).map_err(|e| {
+    // The schedule of a run of another length keeps its shares, but for what the study sets.
+    let base = section.iterations.as_ref().map_or(preset.clone(), |iterations| preset.of_length(*iterations.get_ref()));
+    base.with(&settings).map_err(|e| {
         let alone = |setting: &&Spanned<String>| {
             Config::load(Some(section.preset), None, std::slice::from_ref(setting.get_ref())).is_err()
         };
@@ -248,14 +249,6 @@ fn configuration(
 }
 
 const ITERATIONS: &str = "train.iterations";
-/// Settings of a run of another length: the schedule keeps its shares of the run, but for what was `given`.
-fn scaled(preset: &Config, iterations: u32, given: &[String]) -> Vec<String> {
-    let moved =
-        preset.schedule_of_length(iterations).into_iter().filter(|(key, _)| !given.iter().any(|name| name == key));
-    let moved = moved.map(|(key, count)| format!("{key}={count}"));
-    moved.chain([format!("{ITERATIONS}={iterations}")]).collect()
-}
-
 /// Values to put beside ours; they must know the methods that ask for them.
 fn published(
     text: &Text<'_>,
@@ -271,38 +264,4 @@ fn published(
         return Err(text.fault(&name.span(), problem));
     }
     Ok(published)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn shortened_runs_keep_the_shares_of_density_control_but_not_every_iteration() {
-        let preset = Config::preset(Preset::R2Gaussian);
-        let of = |iterations: u32, key: &str| {
-            let all = scaled(&preset, iterations, &["r2.densify_until_iter".to_owned()]);
-            all.iter().find_map(|setting| setting.strip_prefix(key)?.strip_prefix('=').map(str::to_owned))
-        };
-        let value = |text: &str| Some(text.to_owned());
-        assert_eq!(
-            (of(6000, "r2.densification_interval"), of(6000, "r2.densify_from_iter")),
-            (value("20"), value("100"))
-        );
-        assert_eq!(
-            (of(1000, "r2.densification_interval"), of(1000, "r2.densify_from_iter")),
-            (value("10"), value("17"))
-        );
-        assert_eq!((of(1000, "r2.densify_until_iter"), of(1000, "train.iterations")), (None, value("1000")));
-        let x = scaled(&Config::preset(Preset::XGaussian), 2000, &[]);
-        for setting in [
-            "x.densification_interval=20",
-            "x.densify_from_iter=50",
-            "x.densify_until_iter=800",
-            "x.opacity_reset_interval=400",
-        ] {
-            assert!(x.iter().any(|s| s == setting), "{setting}: {x:?}");
-        }
-        assert!(x.contains(&"x.degree_every=100".to_owned()), "{x:?}");
-    }
 }

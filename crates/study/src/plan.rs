@@ -4,7 +4,7 @@ use crate::COMMIT;
 use crate::data::DataSet;
 use crate::layout::TableLayout;
 use crate::published::Published;
-use nertca_vk::config::{Config, renamed};
+use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::fingerprint::Fingerprint;
 use serde::{Deserialize, Serialize};
@@ -64,7 +64,7 @@ pub struct Run {
 pub struct RunFingerprint {
     /// Fingerprint of the data: of their description or of their bytes.
     pub data: String,
-    /// Fingerprint of all hyper-parameters, including the seed.
+    /// Fingerprint of preset, seed and all settings; constants belong to the program.
     pub configuration: String,
     /// Commit of the program.
     pub commit: String,
@@ -118,59 +118,8 @@ impl Study {
     pub fn fingerprint(&self, run: &Run) -> Result<RunFingerprint> {
         Ok(RunFingerprint {
             data: self.data[run.data].fingerprint(run.seed),
-            configuration: Fingerprint::of(as_before(&self.config(run).to_toml()?).as_bytes()).hex(),
+            configuration: Fingerprint::of(self.config(run).acting_toml()?.as_bytes()).hex(),
             commit: COMMIT.to_owned(),
         })
-    }
-}
-/// Settings, by section, that were added after results were first recorded, with the values that change nothing.
-const NEW_AND_AS_BEFORE: [(&str, &str); 6] = [
-    ("[gaussians]", "fits = 1"),
-    ("[calibrate]", "adjust = \"off\""),
-    ("[gaussians]", "without_catheter = false"),
-    ("[r2]", "integral = \"affine\""),
-    ("[train]", "stop_at_loss_ratio = 0.0"),
-    ("[dynamic]", "occlusion_region = \"depth-range\""),
-];
-
-/// Removes newer settings from a configuration where they change nothing, and gives renamed settings their earlier names. Results
-/// recorded before thus keep their fingerprint.
-fn as_before(configuration: &str) -> String {
-    let mut section = "";
-    let mut kept = String::with_capacity(configuration.len());
-    for line in configuration.split_inclusive('\n') {
-        let text = line.trim_end();
-        if text.starts_with('[') {
-            section = text;
-        }
-        let key = text.split_once(" = ").map_or("", |(key, _)| key);
-        if let Some(before) = renamed::earlier(section.trim_matches(['[', ']']), key) {
-            kept.push_str(&line.replacen(key, before, 1));
-            continue;
-        }
-        if !NEW_AND_AS_BEFORE.contains(&(section, text)) {
-            kept.push_str(line);
-        }
-    }
-    kept
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use nertca_vk::config::Preset;
-
-    #[test]
-    fn newer_settings_count_where_they_change_something() {
-        let of = |settings: &[&str]| {
-            let settings: Vec<String> = settings.iter().map(|s| (*s).to_owned()).collect();
-            Config::load(Some(Preset::R2Gaussian), None, &settings).unwrap().to_toml().unwrap()
-        };
-        let (affine, exact) = (of(&["r2.integral=affine"]), of(&["r2.integral=exact"]));
-        assert_eq!(as_before(&affine).lines().count() + 6, affine.lines().count());
-        assert_eq!(as_before(&exact).lines().count() + 5, exact.lines().count());
-        // In another section, the same line is another setting.
-        let other = "[x]\nintegral = \"affine\"\n";
-        assert_eq!(as_before(other), other);
     }
 }

@@ -103,13 +103,14 @@ const CAPACITY: u32 = 1024;
 /// [`Error::Config`] where the network does not fit the device; [`Error::Internal`] for a device without statistics; errors of
 /// [`Gpu::pipeline`].
 pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> Result<Vec<Compiled>> {
-    let tuning = tuning.clone().for_network(config.method().has_network());
+    let tuning = tuning.clone().for_network(config.has_network());
     let params = ParamMap::new(config, n_phases);
     let setup = Setup { sample_capacity: CAPACITY, n_rays: 1, n_dynamic_samples: 1, ..Setup::default() };
     for purpose in [Purpose::Train, Purpose::Render] {
         params.networks().try_for_each(|map| Network::new(gpu, &tuning, &setup, map, purpose).map(|_| ()))?;
     }
-    for samples in [config.march.static_samples, config.march.render_samples] {
+    let training = config.fields().map(|settings| settings.march.static_samples);
+    for samples in training.into_iter().chain([config.render.render_samples]) {
         Kernels::new(gpu, tuning.clone(), params.line_len() as u32, samples)?;
     }
     (methods::of(config).make_pipelines)(gpu, config, &tuning)?;

@@ -8,8 +8,9 @@ pub mod step;
 use crate::calibrate::adjustment::{Adjusted, Adjustment};
 use crate::calibrate::observed::coarsened_for_calibration;
 use crate::calibrate::pose::{Poses, ViewPose};
-use crate::config::sections::Gaussians;
-use crate::config::{AdjustMode, CalibrateMode, Config, GaussianForm};
+use crate::calibrate::settings::CalibrateMode;
+use crate::config::sections::GaussiansSettings;
+use crate::config::{AdjustMode, GaussianForm};
 use crate::error::{Error, Result};
 use crate::evidence::ratios::ViewEvidence;
 use crate::evidence::series::Series;
@@ -20,6 +21,7 @@ use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::data::SOFT_HULL_CELLS;
 use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Earlier};
 use crate::methods::dynamic_gaussians::made::{MadeGaussians, fingerprint};
+use crate::methods::dynamic_gaussians::rules::Rules;
 use crate::methods::dynamic_gaussians::setup::carried_step;
 use crate::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use crate::methods::dynamic_gaussians::targets::Targets;
@@ -79,7 +81,8 @@ const NEXT_SEED: u32 = 10;
 /// Device errors, and errors of `observe`.
 pub(super) fn adjust(task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result<Option<AdjustedFit>> {
     let AdjustTask { gpu, config, dataset, calibration } = *task;
-    let wanted = config.calibrate.adjust == AdjustMode::Auto && config.calibrate.mode == CalibrateMode::Auto;
+    let config = config.of::<GaussiansSettings>()?;
+    let wanted = config.adjustment.adjust == AdjustMode::Auto && config.calibrate.mode == CalibrateMode::Auto;
     // Displacements of the heart that are stated were measured: they are not to be corrected.
     if !wanted || dataset.heart_shifts() {
         return Ok(None);
@@ -92,7 +95,8 @@ pub(super) fn adjust(task: &AdjustTask<'_>, observe: &mut Observe<'_>) -> Result
     let is_full_size = (coarse.width, coarse.height) == (dataset.width, dataset.height);
     let calibrated = if is_full_size { coarse.corrected(calibration)? } else { stands.at(&start) };
     let motion = SoftMotion::uncarved(evidence);
-    Adjuster { gpu, config, stands, motion, is_full_size }.run(&calibrated, start, observe)
+    let (rules, half_extent_mm) = (Rules::of(&config), config.dynamic.half_extent_mm);
+    Adjuster { gpu, config: &rules, half_extent_mm, stands, motion, is_full_size }.run(&calibrated, start, observe)
 }
 
 /// Start and length of a fit.
@@ -115,7 +119,9 @@ struct Fitted {
 
 struct Adjuster<'a> {
     gpu: &'a Gpu,
-    config: &'a Config,
+    config: &'a Rules,
+    /// Setting of the box that Gaussians are searched in.
+    half_extent_mm: f64,
     stands: Stands<'a>,
     /// Evidence of the views, and the hull of the last fit that began with seeds. It also determines the
     /// extent of the motion grid, which the fits that go on from that one keep.
@@ -219,22 +225,23 @@ impl Adjuster<'_> {
     fn fit(
         &mut self,
         dataset: &Dataset,
-        config: &Config,
+        config: &Rules,
         start: Start<'_>,
         proceed: &mut dyn FnMut() -> Result<()>,
     ) -> Result<Option<Fitted>> {
         proceed()?;
         let Start { earlier, end, prunes } = start;
-        let config = &Config { gaussians: Gaussians { iterations: end, ..config.gaussians.clone() }, ..config.clone() };
+        let config = &mut config.clone();
+        config.gaussians.iterations = end;
         if earlier.is_none_or(|earlier| earlier.reseeds) {
-            self.motion.carve(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
+            self.motion.carve(dataset, dynamic_half(self.half_extent_mm, dataset), SOFT_HULL_CELLS);
         }
         let targets = match Targets::new(dataset, &self.motion, &config.gaussians) {
             // The plan of the run tells what is missing.
             Err(Error::Config { .. }) => return Ok(None),
             targets => targets?,
         };
-        if targets.form(config.gaussians.form) != GaussianForm::Deformable {
+        if targets.form(config.form) != GaussianForm::Deformable {
             return Ok(None);
         }
         let fingerprint = fingerprint(&targets, config);
@@ -256,7 +263,7 @@ impl Adjuster<'_> {
 
 impl Stage {
     /// Settings of a fit that cannot absorb errors of the poses.
-    fn config(&self, config: &Config, seed: u32) -> Config {
+    fn config(&self, config: &Rules, seed: u32) -> Rules {
         let mut stiff = config.clone();
         stiff.seed = seed;
         (stiff.deformable.own_rate, stiff.deformable.smoothness) = (0.0, SMOOTHNESS);

@@ -1,10 +1,10 @@
 //! Judges whether a fit goes on from a deformable set that was fitted before frames were added, or geometry stated anew, instead of
 //! beginning from seeds.
 
-use crate::config::Config;
 use crate::error::Result;
 use crate::gaussians::field::MovingGaussians;
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::rules::Rules;
 use crate::methods::dynamic_gaussians::setup;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
@@ -13,7 +13,7 @@ const MIN_EXPLAINED: f64 = 0.7;
 
 /// Tells whether a fit can go on from an earlier deformable set: whether it has the same phases and views and the same shape, and whether
 /// iterations are left to go on with.
-pub(super) fn can_go_on(targets: &Targets, config: &Config, earlier: &MovingGaussians) -> bool {
+pub(super) fn can_go_on(targets: &Targets, config: &Rules, earlier: &MovingGaussians) -> bool {
     let (was, phases_alike) = (&earlier.rest.setup, earlier.rest.n_phases == targets.n_phases);
     let rests_alike = earlier.setup.rest_phase as usize == targets.rest_phase;
     let has_room = setup::carried_step(&config.gaussians) < config.gaussian_iterations();

@@ -1,13 +1,15 @@
 //! Data of a fit: targets of the Gaussians, and the images of the static field behind them.
 
+use crate::config::sections::GaussiansSettings;
 use crate::config::{Config, GaussianForm};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::fields::data::{FieldData, RayLists};
 use crate::fields::motion;
 use crate::fields::scale::dynamic_half;
 use crate::fitting::extent::between_phases;
 use crate::geometry::ViewRays;
 use crate::methods::dynamic_gaussians::prior;
+use crate::methods::dynamic_gaussians::rules::Rules;
 use crate::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::model::hull::Hull;
@@ -42,11 +44,12 @@ impl GaussianData {
     /// # Errors
     /// [`crate::error::Error::Unmet`] where nothing moves, or too little is known to tell.
     pub fn new(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<GaussianData> {
-        let motion = motion::analyse(dataset, &config.hull);
-        let (hull, targets) = hull_and_targets(config, dataset, notes)?;
-        let scene = Scene::new(config, dataset, &motion, Some(&hull))?;
-        let lists = RayLists::of_hull(config, dataset, &motion, Some(&hull));
-        let fields = FieldData::new(config, dataset, &motion, Some(hull), scene, lists)?;
+        let settings = config.fields().ok_or_else(|| Error::Internal("the configuration has no fields".into()))?;
+        let motion = motion::analyse(dataset, motion::Thresholds::default());
+        let (hull, targets) = hull_and_targets(&config.of()?, dataset, notes)?;
+        let scene = Scene::new(&settings, dataset, &motion, Some(&hull))?;
+        let lists = RayLists::of_hull(dataset, &motion, Some(&hull));
+        let fields = FieldData::new(&settings, dataset, &motion, Some(hull), scene, lists)?;
         let shot = |frame: &Frame| Shot {
             rays: dataset.heart_rays(frame),
             phases: frame.beat_time().phases(dataset.n_phases),
@@ -60,11 +63,15 @@ impl GaussianData {
 pub(super) const SOFT_HULL_CELLS: usize = 112;
 
 /// Computes where vessels may be, and the targets that Gaussians are fitted to.
-fn hull_and_targets(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<(Hull, Targets)> {
-    let mut soft = SoftMotion::new(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
+fn hull_and_targets(
+    config: &Config<GaussiansSettings>,
+    dataset: &Dataset,
+    notes: &mut Vec<String>,
+) -> Result<(Hull, Targets)> {
+    let mut soft = SoftMotion::new(dataset, dynamic_half(config.dynamic.half_extent_mm, dataset), SOFT_HULL_CELLS);
     // Only the hull is made of the ratios, which take as much memory as the images.
     soft.views.iter_mut().for_each(|view| view.ratios.clear());
-    let mut targets = Targets::new(dataset, &soft, &config.gaussians)?;
+    let mut targets = Targets::new(dataset, &soft, &Rules::of(config).gaussians)?;
     if let Some(prior) = &dataset.prior {
         notes.push(prior::apply(&mut targets, prior));
     }
@@ -131,10 +138,10 @@ fn wide_hull(soft: &SoftMotion, dataset: &Dataset) -> Option<String> {
 }
 
 /// Returns a note where more iterations were asked for than usual, without more of them for the vessels.
-fn idle_iterations(config: &Config) -> Option<String> {
-    let (all, vessels) = (config.train.iterations, config.gaussian_iterations());
+fn idle_iterations(config: &Config<GaussiansSettings>) -> Option<String> {
+    let (all, vessels) = (config.train.iterations, config.gaussians.iterations.min(config.train.iterations));
     let usual = Config::preset(config.preset);
-    let as_usual = config.gaussians.iterations <= usual.gaussians.iterations;
+    let as_usual = config.gaussians.iterations <= usual.gaussian_iterations();
     (all > usual.train.iterations && as_usual && vessels < all).then(|| {
         format!(
             "the vessels are fitted in the first {vessels} of the {all} iterations, the others fit the static background only: a \

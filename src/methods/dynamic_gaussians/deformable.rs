@@ -1,7 +1,6 @@
 //! Fits a deformable set: Gaussians of one phase, carried through the beat by a grid, all of it together. [`crate::methods::dynamic_gaussians::start`] prepares
 //! it.
 
-use crate::config::{Config, sections};
 use crate::error::{Error, Result};
 use crate::evidence::series::blur;
 use crate::fitting::iterations::{Iterations, pass_times};
@@ -20,6 +19,7 @@ use crate::methods::dynamic_gaussians::groups::vessels;
 use crate::methods::dynamic_gaussians::members::{MemberBuffers, Members};
 use crate::methods::dynamic_gaussians::per_phase::{MAX_PASSES, check_count, strong};
 use crate::methods::dynamic_gaussians::pruning::{Judge, broad_parts, components, short_parts};
+use crate::methods::dynamic_gaussians::rules::{DeformableRules, FAINT, Rules};
 use crate::methods::dynamic_gaussians::stages::{
     DeformableKernels, DeformablePass, GridBuffers, OwnMotion, OwnMotionBuffers, Track,
 };
@@ -57,7 +57,7 @@ pub struct Earlier<'a> {
 pub struct DeformableTrainer {
     gpu: Gpu,
     targets: Targets,
-    config: Config,
+    config: Rules,
     kernels: (GaussianKernels, DeformableKernels),
     joint: Fit,
     members: MemberBuffers,
@@ -84,7 +84,7 @@ pub(super) struct Fit {
 
 impl Fit {
     /// A fit of everything, with a grid at rest.
-    fn joint(gpu: &Gpu, targets: &Targets, config: &Config) -> Result<Fit> {
+    fn joint(gpu: &Gpu, targets: &Targets, config: &Rules) -> Result<Fit> {
         let settings = targets.lengths.gaussians(&config.gaussians);
         let mut setup = setup::gaussian_setup(targets, &settings);
         let deformable = setup::deformable_setup(targets, &targets.deformable(&config.deformable));
@@ -94,7 +94,7 @@ impl Fit {
     }
 
     /// A fit of the same grid to the same images, blurred, a phase at a time.
-    fn tracking(&self, gpu: &Gpu, targets: &Targets, settings: &sections::Deformable) -> Result<Fit> {
+    fn tracking(&self, gpu: &Gpu, targets: &Targets, settings: &DeformableRules) -> Result<Fit> {
         let setup = setup::track_setup(&self.setup, settings);
         let deformable = MotionGridSetup { grid_rate: settings.track_rate as f32, ..self.deformable };
         let blurred = |values: &[f32]| {
@@ -150,8 +150,7 @@ impl DeformableTrainer {
     ///
     /// # Errors
     /// [`Error::Config`] for impossible settings; device errors.
-    pub fn with(gpu: &Gpu, targets: Targets, config: &Config, particles: &Particles) -> Result<DeformableTrainer> {
-        config.check()?;
+    pub fn with(gpu: &Gpu, targets: Targets, config: &Rules, particles: &Particles) -> Result<DeformableTrainer> {
         let n = check_count(particles)?;
         let kernels = (GaussianKernels::new(gpu)?, DeformableKernels::new(gpu)?);
         let joint = Fit::joint(gpu, &targets, config)?;
@@ -181,7 +180,7 @@ impl DeformableTrainer {
     ///
     /// # Errors
     /// As [`DeformableTrainer::with`].
-    pub fn after(gpu: &Gpu, targets: Targets, config: &Config, earlier: Earlier<'_>) -> Result<DeformableTrainer> {
+    pub fn after(gpu: &Gpu, targets: Targets, config: &Rules, earlier: Earlier<'_>) -> Result<DeformableTrainer> {
         let rest = earlier.field.rest.in_units(targets.units);
         let mut trainer = DeformableTrainer::with(gpu, targets, config, &Particles::fresh(rest.rows.clone()))?;
         let moving = earlier.field.on_grid(rest, trainer.joint.deformable);
@@ -420,7 +419,7 @@ impl DeformableTrainer {
 
     /// Drops Gaussians that are too faint for vessels: they stand for other motion.
     fn clear(&mut self) -> Result<()> {
-        let (faint, setup) = (self.config.gaussians.faint, self.joint.setup);
+        let (faint, setup) = (FAINT, self.joint.setup);
         self.retain(|rows| dense(rows, &setup, faint)).map(|_| ())
     }
 
@@ -433,7 +432,7 @@ impl DeformableTrainer {
     /// Looks for a catheter, and drops it where the settings say so.
     fn find_catheter(&mut self) -> Result<()> {
         self.catheter = Catheter::find(&self.deformable()?, self.targets.lengths.factor);
-        let dropped = self.catheter.as_ref().filter(|_| self.config.gaussians.without_catheter);
+        let dropped = self.catheter.as_ref().filter(|_| self.config.without_catheter);
         if let Some(keep) = dropped.map(|catheter| catheter.members.iter().map(|member| !member).collect()) {
             self.retain(|_| keep)?;
         }
@@ -458,7 +457,7 @@ impl DeformableTrainer {
             "a catheter seems to be in the dynamic field: {extent_mm:.0} mm whose motion falls to {:.0} % of that of the vessels",
             100.0 * slowest
         );
-        Some(match self.config.gaussians.without_catheter {
+        Some(match self.config.without_catheter {
             true => format!("{found}; it is left out (gaussians.without_catheter)"),
             false => format!("{found}; --set gaussians.without_catheter=true leaves it out of field, tree and scores"),
         })

@@ -1,10 +1,10 @@
 //! Last part of a fit that began on coarser images, with all pixels.
 
-use crate::config::Config;
 use crate::error::Result;
 use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Earlier};
 use crate::methods::dynamic_gaussians::remainder::MIN_PHASES;
+use crate::methods::dynamic_gaussians::rules::{NOISE_SCALE, Rules};
 use crate::methods::dynamic_gaussians::setup;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
@@ -12,18 +12,18 @@ use crate::methods::dynamic_gaussians::targets::Targets;
 pub(crate) struct Fine {
     gpu: Gpu,
     targets: Targets,
-    config: Config,
+    config: Rules,
     /// Iteration from which on all pixels are used.
     from: u32,
 }
 
 impl Fine {
     /// Returns the targets that a fit begins on, and those that it ends on where they are finer.
-    pub(crate) fn split(gpu: &Gpu, targets: Targets, config: &Config) -> (Targets, Option<Box<Fine>>) {
+    pub(crate) fn split(gpu: &Gpu, targets: Targets, config: &Rules) -> (Targets, Option<Box<Fine>>) {
         let factor = targets.coarse_factor();
         match setup::fine_step(&config.gaussians).filter(|_| factor > 1) {
             Some(from) => {
-                let coarse = targets.coarser(factor, config.gaussians.noise_scale);
+                let coarse = targets.coarser(factor, NOISE_SCALE);
                 let mut targets = targets;
                 // All pixels are used from a renewal of the bounds on, which needs upper bounds alone.
                 if targets.fewest_phases() >= MIN_PHASES {

@@ -1,7 +1,7 @@
 //! Fit of the Gaussians in the form that configuration and data ask for.
 
 use crate::choice::Choice;
-use crate::config::{Config, GaussianForm};
+use crate::config::GaussianForm;
 use crate::error::{Error, Result};
 use crate::fitting::fit::{Advance, FitProgress, FitWork, Iterates, Measured};
 use crate::fitting::losses::StepLoss;
@@ -14,6 +14,7 @@ use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Earlier};
 use crate::methods::dynamic_gaussians::fine::Fine;
 use crate::methods::dynamic_gaussians::made::Made;
 use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
+use crate::methods::dynamic_gaussians::rules::Rules;
 use crate::methods::dynamic_gaussians::start::DeformableStart;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
@@ -38,10 +39,10 @@ impl GaussianFit {
     pub(crate) fn new(
         gpu: &Gpu,
         mut targets: Targets,
-        config: &Config,
+        config: &Rules,
         earlier: Option<Earlier<'_>>,
     ) -> Result<GaussianFit> {
-        if targets.form(config.gaussians.form) != GaussianForm::Deformable {
+        if targets.form(config.form) != GaussianForm::Deformable {
             return Ok(GaussianFit::PerPhase(Box::new(GaussianTrainer::new(gpu, targets, config)?)));
         }
         match earlier.filter(|earlier| !earlier.field.rest.rows.is_empty()) {

@@ -1,8 +1,8 @@
 //! Lengths of the settings, in pixels, adapted to the images at hand: larger images show the same field, and noise asks for
 //! smoother vessels.
 
-use crate::config::sections::{Deformable, Gaussians};
 use crate::evidence::series::blur;
+use crate::methods::dynamic_gaussians::rules::{DeformableRules, GaussianRules};
 use crate::raster::Image;
 use std::borrow::Borrow;
 
@@ -40,9 +40,9 @@ impl Lengths {
     }
 
     /// Settings with lengths in pixels of the images.
-    pub fn gaussians(self, settings: &Gaussians) -> Gaussians {
+    pub fn gaussians(self, settings: &GaussianRules) -> GaussianRules {
         let min_scale = self.smoothing * self.factor * settings.min_scale;
-        Gaussians {
+        GaussianRules {
             first_scale: (self.factor * settings.first_scale).max(min_scale),
             min_scale,
             max_scale: (self.factor * settings.max_scale).max(min_scale),
@@ -53,8 +53,8 @@ impl Lengths {
     }
 
     /// Settings with lengths in pixels of the images. Penalties stay: squared lengths grow as the number of pixels does.
-    pub fn deformable(self, settings: &Deformable) -> Deformable {
-        Deformable {
+    pub fn deformable(self, settings: &DeformableRules) -> DeformableRules {
+        DeformableRules {
             node: self.factor * settings.node,
             grid_rate: self.factor * settings.grid_rate,
             own_rate: self.factor * settings.own_rate,
@@ -87,7 +87,7 @@ pub fn vessel_width(images: impl Iterator<Item = impl Borrow<Image>>, strongest:
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Config, Preset};
+    use crate::methods::dynamic_gaussians::test_targets::rules;
 
     /// A vessel across the whole image, `width` pixels wide across its direction (degrees).
     fn vessel(width: f64, angle_deg: f64) -> Image {
@@ -110,7 +110,7 @@ mod tests {
 
     #[test]
     fn lengths_follow_the_images_and_noise_the_vessels_width() {
-        let settings = Config::preset(Preset::Fast).gaussians;
+        let settings = rules().gaussians;
         let min = |size: usize, width: f64, noise: f32| {
             Lengths::new(size, width, noise, settings.min_scale).gaussians(&settings).min_scale
         };

@@ -1,9 +1,9 @@
 //! A fit that was made before its run began, while views were adjusted: a run with the same images, geometry and settings does not repeat
 //! it.
 
-use crate::config::Config;
 use crate::fingerprint::Fingerprint;
 use crate::gaussians::field::GaussianField;
+use crate::methods::dynamic_gaussians::rules::Rules;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
 /// A fit of Gaussians that was done before its run begins.
@@ -28,7 +28,7 @@ pub(crate) struct Made {
 impl Made {
     /// Takes over a fit if it is one of these targets and settings, and if no state between its first and last iteration is scored. A
     /// checkpoint that is saved meanwhile holds the field after all iterations; a run that is resumed there repeats the fit.
-    pub(crate) fn of(made: &MadeGaussians, targets: &Targets, config: &Config) -> Option<Made> {
+    pub(crate) fn of(made: &MadeGaussians, targets: &Targets, config: &Rules) -> Option<Made> {
         let end = config.gaussian_iterations();
         let every = config.train.validate_every;
         let whole = made.losses.len() == end as usize && (every == 0 || every >= end);
@@ -66,7 +66,7 @@ impl Made {
 }
 
 /// Returns the fingerprint of all that decides a fit that has not begun.
-pub(crate) fn fingerprint(targets: &Targets, config: &Config) -> String {
+pub(crate) fn fingerprint(targets: &Targets, config: &Rules) -> String {
     let mut fingerprint = Fingerprint::default();
     let images = [&targets.images, &targets.low, &targets.high, &targets.contrast];
     images.into_iter().flatten().for_each(|v| fingerprint.word(v.to_bits()));

@@ -1,6 +1,5 @@
 //! Fits a set of Gaussians per phase: many iterations per submit, and a step on the host where their number changes.
 
-use crate::config::{Config, sections};
 use crate::error::{Error, Result};
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::ring::losses;
@@ -12,6 +11,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup};
 use crate::methods::dynamic_gaussians::groups::vessels;
+use crate::methods::dynamic_gaussians::rules::{FAINT, GaussianRules, Rules};
 use crate::methods::dynamic_gaussians::target_buffers::{
     Renewal, TargetPart, renew_bounds, take_images, undivided_targets,
 };
@@ -22,7 +22,7 @@ use crate::methods::dynamic_gaussians::{seeds, setup};
 pub struct GaussianTrainer {
     gpu: Gpu,
     targets: Targets,
-    settings: sections::Gaussians,
+    settings: GaussianRules,
     seed: u32,
     setup: GaussianSetup,
     per_submit: u32,
@@ -39,7 +39,7 @@ impl GaussianTrainer {
     ///
     /// # Errors
     /// [`Error::Config`] for impossible settings; [`Error::Unmet`] when there is no place for a Gaussian; device errors.
-    pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<GaussianTrainer> {
+    pub fn new(gpu: &Gpu, targets: Targets, config: &Rules) -> Result<GaussianTrainer> {
         let mut rows = seeds::seeds(&targets, &targets.lengths.gaussians(&config.gaussians), config.seed);
         let trainer = Self::with(gpu, targets, config, &Particles::fresh(rows.clone()))?;
         let density = seeds::first_density(&trainer.targets, &trainer.images()?);
@@ -52,8 +52,7 @@ impl GaussianTrainer {
     ///
     /// # Errors
     /// As [`GaussianTrainer::new`].
-    pub fn with(gpu: &Gpu, targets: Targets, config: &Config, particles: &Particles) -> Result<GaussianTrainer> {
-        config.check()?;
+    pub fn with(gpu: &Gpu, targets: Targets, config: &Rules, particles: &Particles) -> Result<GaussianTrainer> {
         let n = check_count(particles)?;
         let settings = targets.lengths.gaussians(&config.gaussians);
         let setup = setup::gaussian_setup(&targets, &settings);
@@ -166,7 +165,7 @@ impl GaussianTrainer {
     /// Drops Gaussians that are too faint for vessels: they stand for other motion.
     fn clear(&mut self) -> Result<()> {
         let mut particles = self.particles.download(&self.gpu, self.n as usize)?;
-        particles.retain(&dense(&particles.rows, &self.setup, self.settings.faint));
+        particles.retain(&dense(&particles.rows, &self.setup, FAINT));
         self.replace(&particles)
     }
 

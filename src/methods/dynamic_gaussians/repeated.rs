@@ -1,12 +1,12 @@
 //! Several fits to the same images, whose mean is the dynamic field: each fit to noisy or inconsistent images has errors of its own.
 
-use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::gaussians::field::GaussianField;
 use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::deformable::Earlier;
 use crate::methods::dynamic_gaussians::fit::GaussianFit;
 use crate::methods::dynamic_gaussians::made::{Made, MadeGaussians};
+use crate::methods::dynamic_gaussians::rules::Rules;
 use crate::methods::dynamic_gaussians::setup;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
@@ -53,7 +53,7 @@ impl Targets {
 /// take their motion from it, and its iterations are reported when they are done.
 pub(crate) struct Repeated {
     gpu: Gpu,
-    config: Config,
+    config: Rules,
     /// Number of all fits.
     fits: u32,
     /// Fit that is under way.
@@ -82,12 +82,12 @@ impl Repeated {
     pub(crate) fn new(
         gpu: &Gpu,
         targets: Targets,
-        config: &Config,
+        config: &Rules,
         earlier: Option<&GaussianField>,
         made: Option<&MadeGaussians>,
     ) -> Result<Repeated> {
         let step = setup::carried_step(&config.gaussians);
-        let fits = if earlier.is_some() { 1 } else { targets.fits(config.gaussians.fits).0.max(1) };
+        let fits = if earlier.is_some() { 1 } else { targets.fits(config.fits).0.max(1) };
         let stage = match fits {
             1 => Stage::Run { mean: None },
             _ => Stage::First { images: targets.clone(), losses: Vec::new() },
@@ -194,7 +194,7 @@ impl Repeated {
         let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
         let left = (number + 1 < self.fits).then(|| images.clone());
         let earlier = first.field().moving().map(|field| Earlier { field, step: 0, reseeds: true });
-        self.fit = GaussianFit::new(&self.gpu, images, &Config { seed, ..self.config.clone() }, earlier)?;
+        self.fit = GaussianFit::new(&self.gpu, images, &Rules { seed, ..self.config.clone() }, earlier)?;
         self.stage = Stage::Other { images: left, first, others, mean };
         Ok(())
     }

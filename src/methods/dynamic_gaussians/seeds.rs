@@ -1,10 +1,10 @@
 //! First places of Gaussians, drawn from the hull's cells, and later places where data are missing.
 
-use crate::config::sections;
 use crate::gaussians::field::rotation_none;
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::Gaussian;
 use crate::methods::dynamic_gaussians::likelihood::likelihoods;
+use crate::methods::dynamic_gaussians::rules::{GaussianRules, MISSING};
 use crate::methods::dynamic_gaussians::targets::{PossibleVessel, Targets};
 use crate::random::{STREAM_JITTER, STREAM_PLACE, uniform01};
 use glam::DVec3;
@@ -27,7 +27,7 @@ fn draw(weights: &[f64], count: usize, seed: u32, round: u32) -> Vec<usize> {
 #[derive(Clone, Copy)]
 struct Draw<'a> {
     targets: &'a Targets,
-    settings: &'a sections::Gaussians,
+    settings: &'a GaussianRules,
     seed: u32,
     round: u32,
 }
@@ -53,12 +53,12 @@ impl Draw<'_> {
 }
 
 /// First Gaussians of every phase, of density 1; [`first_density`] tells the density they should have.
-pub fn seeds(targets: &Targets, settings: &sections::Gaussians, seed: u32) -> Vec<Gaussian> {
+pub fn seeds(targets: &Targets, settings: &GaussianRules, seed: u32) -> Vec<Gaussian> {
     (0..targets.places.len()).flat_map(|phase| seeds_at(targets, settings, seed, phase)).collect()
 }
 
 /// First Gaussians of a phase; see [`seeds`].
-pub fn seeds_at(targets: &Targets, settings: &sections::Gaussians, seed: u32, phase: usize) -> Vec<Gaussian> {
+pub fn seeds_at(targets: &Targets, settings: &GaussianRules, seed: u32, phase: usize) -> Vec<Gaussian> {
     let draw = Draw { targets, settings, seed, round: phase as u32 };
     draw.gaussians(&likelihoods(targets, phase), settings.count as usize, phase, 1.0).collect()
 }
@@ -73,21 +73,21 @@ pub fn first_density(targets: &Targets, images: &[f32]) -> f64 {
 }
 
 /// Returns the number of new Gaussians of a phase.
-pub fn n_additions(settings: &sections::Gaussians) -> usize {
+pub fn n_additions(settings: &GaussianRules) -> usize {
     (settings.grow_share * f64::from(settings.count)) as usize
 }
 
 /// New Gaussians at places of the hull where every view lacks line integral. `images` are those of the present field,
 /// `[image][pixel]`.
-pub fn additions(targets: &Targets, settings: &sections::Gaussians, seed: u32, images: &[f32]) -> Vec<Gaussian> {
+pub fn additions(targets: &Targets, settings: &GaussianRules, seed: u32, images: &[f32]) -> Vec<Gaussian> {
     let missing = missing_images(targets, images);
     let count = n_additions(settings);
     let mut all = Vec::new();
     for (phase, places) in targets.places.iter().enumerate() {
         let weights: Vec<f64> =
-            places.iter().map(|p| enough(settings, lacking(targets, &missing, phase, |_| p.position))).collect();
+            places.iter().map(|p| enough(lacking(targets, &missing, phase, |_| p.position))).collect();
         let draw = Draw { targets, settings, seed, round: (targets.n_phases + phase) as u32 };
-        all.extend(draw.gaussians(&weights, count, phase, added_density(targets, settings)));
+        all.extend(draw.gaussians(&weights, count, phase, added_density(targets)));
     }
     all
 }
@@ -96,7 +96,7 @@ pub fn additions(targets: &Targets, settings: &sections::Gaussians, seed: u32, i
 /// integral at half of the phases or more at which contrast fills it, by `is_filled` (place, phase); phases may lie between two.
 pub fn deformable_additions(
     targets: &Targets,
-    settings: &sections::Gaussians,
+    settings: &GaussianRules,
     seed: u32,
     images: &[f32],
     carried: impl Fn(DVec3, f64) -> DVec3,
@@ -111,16 +111,16 @@ pub fn deformable_additions(
         let filled = (0..targets.n_phases).filter(|phase| is_filled(place.position, *phase));
         let mut all: Vec<f64> = filled.map(at).collect();
         all.sort_by(f64::total_cmp);
-        all.len().checked_sub(1).map_or(0.0, |last| enough(settings, all[last / 2]))
+        all.len().checked_sub(1).map_or(0.0, |last| enough(all[last / 2]))
     };
     let weights: Vec<f64> = places.iter().map(weight).collect();
     let draw = Draw { targets, settings, seed, round: targets.n_phases as u32 };
-    draw.gaussians(&weights, count, targets.rest_phase, added_density(targets, settings)).collect()
+    draw.gaussians(&weights, count, targets.rest_phase, added_density(targets)).collect()
 }
 
 /// Density of a new Gaussian, whose line integral does not depend on the size of a pixel.
-fn added_density(targets: &Targets, settings: &sections::Gaussians) -> f64 {
-    settings.missing / targets.lengths.factor
+fn added_density(targets: &Targets) -> f64 {
+    MISSING / targets.lengths.factor
 }
 
 /// Minimum line integral that the views of a phase lack at a point; `at` gives its position at a time after the phase, in
@@ -143,8 +143,8 @@ fn lacking(targets: &Targets, missing: &[f32], phase: usize, at: impl Fn(f64) ->
 }
 
 /// Returns `lacking` where it is worth a Gaussian, else 0.
-fn enough(settings: &sections::Gaussians, lacking: f64) -> f64 {
-    if lacking > settings.missing { lacking } else { 0.0 }
+fn enough(lacking: f64) -> f64 {
+    if lacking > MISSING { lacking } else { 0.0 }
 }
 
 /// Mean over the 3 x 3 pixels around each pixel of what the images lack; outside the image nothing is lacking.

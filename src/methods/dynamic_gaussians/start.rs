@@ -1,7 +1,6 @@
 //! Start of a deformable set: a set of Gaussians per phase, of which that of the rest phase becomes the deformable set; then the grid is
 //! tracked from phase to phase.
 
-use crate::config::{Config, sections};
 use crate::error::{Error, Result};
 use crate::gaussians::field::{Gaussians, mass};
 use crate::gaussians::particles::Particles;
@@ -9,6 +8,7 @@ use crate::gpu::device::Gpu;
 use crate::kernels::layout::Gaussian;
 use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Fit};
 use crate::methods::dynamic_gaussians::per_phase::{GaussianTrainer, strong};
+use crate::methods::dynamic_gaussians::rules::{Rules, TAKE};
 use crate::methods::dynamic_gaussians::stages::Track;
 use crate::methods::dynamic_gaussians::targets::Targets;
 use std::ops::Range;
@@ -16,7 +16,7 @@ use std::ops::Range;
 /// A deformable set in preparation.
 pub struct DeformableStart {
     gpu: Gpu,
-    config: Config,
+    config: Rules,
     stage: Stage,
 }
 
@@ -43,14 +43,11 @@ impl DeformableStart {
     ///
     /// # Errors
     /// As [`GaussianTrainer::new`].
-    pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<DeformableStart> {
+    pub fn new(gpu: &Gpu, targets: Targets, config: &Rules) -> Result<DeformableStart> {
         // Strays are dropped when all iterations are done: a stray may find its vessel before.
-        let warm = sections::Gaussians {
-            iterations: config.deformable.warm_iterations,
-            link: 0.0,
-            ..config.gaussians.clone()
-        };
-        let warm = Config { gaussians: warm, ..config.clone() };
+        let warm =
+            GaussianRules { iterations: config.deformable.warm_iterations, link: 0.0, ..config.gaussians.clone() };
+        let warm = Rules { gaussians: warm, ..config.clone() };
         let warming = GaussianTrainer::new(gpu, targets, &warm)?;
         Ok(DeformableStart { gpu: gpu.clone(), config: config.clone(), stage: Stage::Warming(Box::new(warming)) })
     }
@@ -93,7 +90,7 @@ impl DeformableStart {
         }
         let meanwhile = first.model()?;
         let mut found = Particles::fresh(meanwhile.rows.clone());
-        let strong = strong(&found.rows, first.setup(), self.config.deformable.take);
+        let strong = strong(&found.rows, first.setup(), TAKE);
         let rest_phase = first.targets().rest_phase as u32;
         let keep: Vec<bool> =
             found.rows.iter().zip(strong).map(|(g, strong)| strong && g.phase == rest_phase).collect();
@@ -199,7 +196,7 @@ impl DeformableTrainer {
     ///
     /// # Errors
     /// As [`DeformableStart::new`] and [`DeformableStart::advance`].
-    pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<DeformableTrainer> {
+    pub fn new(gpu: &Gpu, targets: Targets, config: &Rules) -> Result<DeformableTrainer> {
         let mut start = DeformableStart::new(gpu, targets, config)?;
         loop {
             if let Some(trainer) = start.advance()? {

@@ -1,6 +1,6 @@
 //! Freedom of the motion of a deformable set, by the noise of the images and the number of views.
 
-use crate::config::sections::Deformable;
+use crate::methods::dynamic_gaussians::rules::DeformableRules;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
 /// Number of views up to which the motion is stiff in noise: with few views, free motion explains noise.
@@ -26,24 +26,24 @@ impl Targets {
     }
 
     /// Returns the settings of a deformable set with lengths in pixels of the images and the freedom of motion that noise allows.
-    pub fn deformable(&self, settings: &Deformable) -> Deformable {
+    pub fn deformable(&self, settings: &DeformableRules) -> DeformableRules {
         let settings = self.lengths.deformable(settings);
         if !self.needs_stiff_motion() {
             return settings;
         }
-        Deformable { own_rate: 0.0, smoothness: settings.smoothness.max(STIFF_SMOOTHNESS), ..settings }
+        DeformableRules { own_rate: 0.0, smoothness: settings.smoothness.max(STIFF_SMOOTHNESS), ..settings }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Config, Preset};
+    use crate::methods::dynamic_gaussians::test_targets::rules;
     use crate::methods::dynamic_gaussians::test_targets::{PHASES, SIDE, targets};
 
     #[test]
     fn motion_is_stiff_with_two_views_and_with_three_noisy_ones() {
-        let settings = Config::preset(Preset::Fast).deformable;
+        let settings = rules().deformable;
         for (n_views, noise, stiff) in
             [(2, 0.1, true), (2, 0.2, true), (3, 0.1, false), (3, 0.2, true), (4, 0.1, false), (4, 0.2, false)]
         {
@@ -55,7 +55,7 @@ mod tests {
         }
         let mut noisy = targets(&vec![0.0; PHASES * SIDE * SIDE], 1);
         noisy.noise.fill(0.2);
-        let smoother = Deformable { smoothness: 0.5, ..settings };
+        let smoother = DeformableRules { smoothness: 0.5, ..settings };
         assert_eq!(noisy.deformable(&smoother).smoothness, 0.5, "a smoother setting stays");
     }
 }

@@ -1,12 +1,13 @@
 //! Targets of Gaussians: views, bounds of the dynamic field's images, weights, and where vessels may be.
 
-use crate::config::{GaussianForm, sections};
+use crate::config::GaussianForm;
 use crate::error::{Error, Result};
 use crate::evidence::ratios::ViewEvidence;
 use crate::evidence::series::Series;
 use crate::gaussians::field::Units;
 use crate::gaussians::view::SplatView;
 use crate::methods::dynamic_gaussians::lengths::{Lengths, vessel_width};
+use crate::methods::dynamic_gaussians::rules::{GaussianRules, NOISE_SCALE};
 use crate::methods::dynamic_gaussians::shared_images::SharedImages;
 use crate::methods::dynamic_gaussians::soft_hull::carve::{HullCell, SoftMotion};
 use crate::raster::Image;
@@ -109,7 +110,7 @@ impl Targets {
     ///
     /// # Errors
     /// [`Error::Unmet`] when nothing moves, or too little is known to tell; [`Error::Config`] when a pixel is not a number.
-    pub fn new(dataset: &Dataset, motion: &SoftMotion, settings: &sections::Gaussians) -> Result<Targets> {
+    pub fn new(dataset: &Dataset, motion: &SoftMotion, settings: &GaussianRules) -> Result<Targets> {
         if motion.views.is_empty() {
             let problem = "no training view has two phases, e.g. because the C-arm or the table moves from image to \
                            image, so the static background behind the vessels is not known. Try the preset paper, \
@@ -185,7 +186,7 @@ impl Targets {
                 slots.push(slot);
             }
         }
-        let weights = motion.views.iter().flat_map(|v| weights(dataset, v, strongest, settings.noise_scale));
+        let weights = motion.views.iter().flat_map(|v| weights(dataset, v, strongest, NOISE_SCALE));
         targets.weight = SharedImages::new(weights.collect(), slots.clone(), dataset.n_pixels());
         let noise = motion.views.iter().flat_map(|v| v.background.noise.values.iter().map(|s| share(*s)));
         targets.noise = SharedImages::new(noise.collect(), slots, dataset.n_pixels());

@@ -1,9 +1,11 @@
 //! Small targets for the tests of this room.
 
+use crate::config::{Config, Preset};
 use crate::gaussians::field::Units;
 use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry};
 use crate::methods::dynamic_gaussians::lengths::Lengths;
+use crate::methods::dynamic_gaussians::rules::Rules;
 use crate::methods::dynamic_gaussians::shared_images::SharedImages;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
@@ -50,4 +52,9 @@ pub fn targets(images: &[f32], n_views: usize) -> Targets {
         places: vec![Vec::new(); PHASES],
         cell: 1.0,
     }
+}
+
+/// Returns the numbers of the default run.
+pub(super) fn rules() -> Rules {
+    Rules::of(&Config::preset(Preset::Fast).of().unwrap())
 }

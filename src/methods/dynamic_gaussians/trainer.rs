@@ -13,6 +13,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
 use crate::methods::dynamic_gaussians::data::{GaussianData, Shot};
 use crate::methods::dynamic_gaussians::repeated::Repeated;
+use crate::methods::dynamic_gaussians::rules::Rules;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Gaussians of a run, and the static field behind them.
@@ -40,7 +41,7 @@ impl GaussiansFit {
     /// Errors of [`Repeated::new`] and [`FieldsFit::new`].
     pub(crate) fn new(data: GaussianData, start: &FitStart<'_>) -> Result<GaussiansFit> {
         let GaussianData { targets, fields, shots } = data;
-        let (gpu, config, from) = (start.gpu, start.config, start.from);
+        let (gpu, config, from) = (start.gpu, &Rules::of(&start.config.of()?), start.from);
         let gaussians_to = |wanted| from.field_to(wanted).and_then(|field| field.gaussians.as_ref());
         let (earlier, saved_fields) = (gaussians_to(Use::GoOn), SavedFields::at(from));
         let done = saved_fields.filter(|_| from.field_to(Use::Resume).is_some()).map_or(0, |saved| saved.step());
@@ -138,7 +139,7 @@ impl Iterates for GaussiansFit {
         if self.gaussians.is_none() || self.fields.progress().step >= until {
             return self.fields.advance(until);
         }
-        let end = self.fields.data().config.gaussian_iterations();
+        let end = self.fields.data().settings.begin;
         let advance = self.advance_gaussians(until, end)?;
         if self.gaussians.is_none() {
             self.set_remaining_images()?;
@@ -153,7 +154,7 @@ impl Fit for GaussiansFit {
     }
 
     fn feed(&self) -> FieldFeed {
-        let params_fixed_until = self.fields.data().config.gaussian_iterations();
+        let params_fixed_until = self.fields.data().settings.begin;
         FieldFeed { params_fixed_until, gaussians: Some(self.feed.clone()), ..self.fields.feed() }
     }
 

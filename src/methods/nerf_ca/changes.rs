@@ -51,14 +51,14 @@ pub fn rays(dataset: &Dataset, motion: &[ViewMotion], changes: &[Vec<f32>], min:
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Config, Preset};
+    use crate::fields::motion::Thresholds;
     use crate::fields::motion::analyse;
     use crate::scan::small::small_dataset;
 
     #[test]
     fn changes_are_those_of_the_transmission_from_0_to_1_in_each_view() {
         let dataset = small_dataset(6, 5, 3).unwrap();
-        let motion = analyse(&dataset, &Config::preset(Preset::NerfCa).hull);
+        let motion = analyse(&dataset, Thresholds::default());
         let changes = of_views(&dataset, &motion);
         for (of_view, m) in changes.iter().zip(&motion) {
             let images: Vec<_> = dataset.training().iter().filter(|f| f.view == m.view).collect();
@@ -85,7 +85,7 @@ mod tests {
     #[test]
     fn nothing_changes_where_there_is_one_image_and_all_are_the_others_where_all_change() {
         let mut dataset = small_dataset(6, 5, 3).unwrap();
-        let motion = analyse(&dataset, &Config::preset(Preset::NerfCa).hull);
+        let motion = analyse(&dataset, Thresholds::default());
         let (list, n) = rays(&dataset, &motion, &of_views(&dataset, &motion), -1.0);
         assert!(n * 2 == list.len() && list[..n] == list[n..]);
         dataset.frames.retain(|f| f.phase == 0);

@@ -99,7 +99,7 @@ mod tests {
     use crate::methods::r2_gaussian::parameters::round;
 
     fn settings() -> R2 {
-        Config::preset(Preset::R2Gaussian).r2
+        Config::preset(Preset::R2Gaussian).of::<crate::config::sections::R2Settings>().unwrap().method.r2
     }
 
     /// A small and a large Gaussian in each of two sets, all with a large image gradient.

@@ -1,6 +1,7 @@
 //! Constants, rates and turns of a fit as R2-Gaussian does it.
 
 use crate::config::sections::R2;
+use crate::config::sections::R2Settings;
 use crate::config::{Config, R2Integral};
 use crate::fitting::RING_LENGTH;
 use crate::fitting::sets::seed_of_set;
@@ -12,13 +13,21 @@ use crate::methods::r2_gaussian::parameters::ScaleBounds;
 use crate::methods::r2_gaussian::stages::box_parts;
 use crate::random::{STREAM_BOX, uniform01};
 
+/// Decay of Adam's first and second moments, as in the public code.
+const BETAS: [f64; 2] = [0.9, 0.999];
+/// Constant added to the denominator of Adam's update, as in the public code.
+const EPSILON: f64 = 1e-15;
+
 /// Half side of the square in which a Gaussian is seen, standard deviations along its longest axis.
 const CUT: f32 = 3.0;
+/// Learning rates at the end, as in the public code: of positions, of densities before the softplus, of scales before the sigmoid, and of
+/// quaternions.
+const LAST_RATES: [f64; 4] = [2e-5, 1e-3, 5e-4, 1e-4];
 /// Bits behind the point of the integer sums: pictures and densities up to 512, in steps of 2.4e-7.
 const FIXED_POINT_BITS: i32 = 22;
 
 /// Constants that stages share with other fits of Gaussians.
-pub fn gaussian_setup(data: &R2Data, config: &Config) -> GaussianSetup {
+pub fn gaussian_setup(data: &R2Data, config: &Config<R2Settings>) -> GaussianSetup {
     let bounds = ScaleBounds::of(&config.r2);
     let n_sets = data.n_sets() as u32;
     let n_pixels = data.n_pixels() as u32;
@@ -34,9 +43,9 @@ pub fn gaussian_setup(data: &R2Data, config: &Config) -> GaussianSetup {
         fixed_point: 2f32.powi(FIXED_POINT_BITS),
         // Each set has its own loss; their mean is reported.
         loss_weight: 1.0 / n_sets as f32,
-        beta1: config.adam.beta1 as f32,
-        beta2: config.adam.beta2 as f32,
-        epsilon: config.adam.epsilon as f32,
+        beta1: BETAS[0] as f32,
+        beta2: BETAS[1] as f32,
+        epsilon: EPSILON as f32,
         ring_length: RING_LENGTH,
         n_images: n_sets,
         image_stride: n_pixels.next_multiple_of(4),
@@ -66,8 +75,8 @@ pub fn r2_setup(data: &R2Data, settings: &R2) -> R2Setup {
 }
 
 /// One row per iteration, and one more for timing.
-pub fn schedule(config: &Config) -> Vec<R2Schedule> {
-    let (r2, adam, n) = (&config.r2, &config.adam, config.train.iterations);
+pub fn schedule(config: &Config<R2Settings>) -> Vec<R2Schedule> {
+    let (r2, n) = (&config.r2, config.train.iterations);
     let mut updates = 0;
     let row = |step: u32| {
         let is_update = !densifies(r2, step);
@@ -76,12 +85,12 @@ pub fn schedule(config: &Config) -> Vec<R2Schedule> {
             |start: f64, end: f64| (start * (end / start).powf((f64::from(step) / f64::from(n)).min(1.0))) as f32;
         let bias = |beta: f64| (1.0 - beta.powi(updates.max(1))) as f32;
         R2Schedule {
-            position_rate: rate(r2.position_rate, r2.position_rate_end),
-            density_rate: rate(r2.density_rate, r2.density_rate_end),
-            scale_rate: rate(r2.scale_rate, r2.scale_rate_end),
-            rotation_rate: rate(r2.rotation_rate, r2.rotation_rate_end),
-            bias1: bias(adam.beta1),
-            bias2: bias(adam.beta2),
+            position_rate: rate(r2.position_rate, LAST_RATES[0]),
+            density_rate: rate(r2.density_rate, LAST_RATES[1]),
+            scale_rate: rate(r2.scale_rate, LAST_RATES[2]),
+            rotation_rate: rate(r2.rotation_rate, LAST_RATES[3]),
+            bias1: bias(BETAS[0]),
+            bias2: bias(BETAS[1]),
             updates: u32::from(is_update),
         }
     };
@@ -90,7 +99,7 @@ pub fn schedule(config: &Config) -> Vec<R2Schedule> {
 
 /// Turns of each set in each iteration of the schedule: an image, in an order that is drawn anew when all have been seen, and a
 /// box anywhere in the volume.
-pub fn turns(data: &R2Data, config: &Config) -> Vec<PictureTurn> {
+pub fn turns(data: &R2Data, config: &Config<R2Settings>) -> Vec<PictureTurn> {
     let r2 = &config.r2;
     let voxel = 2.0 / f64::from(r2.voxels);
     let room = 2.0 - voxel * f64::from(r2.tv_box);
@@ -113,7 +122,7 @@ mod tests {
 
     #[test]
     fn rates_fall_and_density_control_takes_no_step() {
-        let config = Config::preset(Preset::R2Gaussian);
+        let config = Config::preset(Preset::R2Gaussian).of::<R2Settings>().unwrap();
         let rows = schedule(&config);
         assert_eq!(rows.len(), 30_001);
         let close = |got: f32, want: f64| assert!((f64::from(got) / want - 1.0).abs() < 1e-5, "{got} {want}");
@@ -129,7 +138,7 @@ mod tests {
 
     #[test]
     fn every_image_has_its_turn_and_boxes_stay_inside() {
-        let config = Config::preset(Preset::R2Gaussian);
+        let config = Config::preset(Preset::R2Gaussian).of::<R2Settings>().unwrap();
         let view = SplatView {
             rows: [glam::DVec3::X; 3],
             offsets: [0.0; 3],

@@ -11,6 +11,8 @@ use crate::methods::r2_gaussian::parameters::{ScaleBounds, round};
 use crate::random::{STREAM_JITTER, STREAM_PLACE, permute, uniform01};
 use glam::DVec3;
 
+/// Density of a Gaussian at the start, as a share of the back-projection there, as in the public code.
+const DENSITY_SHARE: f64 = 0.15;
 /// Minimum density that can be stored and fitted.
 const MIN_DENSITY: f64 = 1e-9;
 
@@ -50,7 +52,7 @@ fn places(data: &R2Data, settings: &R2, seed: u32, set: usize) -> (Vec<(DVec3, f
         let k = candidates[permute(i as u32, n, seed_of_set(seed, set), 0, STREAM_PLACE) as usize];
         let index = DVec3::new((k % side) as f64, (k / side % side) as f64, (k / side / side) as f64);
         // The reference code takes the voxel's corner instead of its centre.
-        (voxel * index - 1.0, settings.density_share * f64::from(volume[k]))
+        (voxel * index - 1.0, DENSITY_SHARE * f64::from(volume[k]))
     });
     (drawn.collect(), None)
 }

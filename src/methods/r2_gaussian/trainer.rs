@@ -1,5 +1,6 @@
 //! Fits Gaussians as R2-Gaussian does: all sets at once, one view each per iteration, and density control on the host.
 
+use crate::config::sections::R2Settings;
 use crate::config::{Config, R2Integral};
 use crate::error::{Error, Result};
 use crate::fitting::iterations::{Iterations, pass_times};
@@ -28,7 +29,7 @@ const MAX_PASSES: u32 = 64;
 pub struct R2Trainer {
     gpu: Gpu,
     data: R2Data,
-    config: Config,
+    config: Config<R2Settings>,
     setup: GaussianSetup,
     r2: R2Setup,
     pictures: PictureSetup,
@@ -45,7 +46,7 @@ impl R2Trainer {
     ///
     /// # Errors
     /// [`Error::Config`] for impossible settings; device errors.
-    pub fn new(gpu: &Gpu, data: R2Data, config: &Config) -> Result<(R2Trainer, Vec<String>)> {
+    pub fn new(gpu: &Gpu, data: R2Data, config: &Config<R2Settings>) -> Result<(R2Trainer, Vec<String>)> {
         let (rows, mut notes) = first_rows(&data, &config.r2, config.seed);
         let max = max_of_set(gpu, &data);
         if max < config.r2.max_num_gaussians {
@@ -62,8 +63,7 @@ impl R2Trainer {
     ///
     /// # Errors
     /// As [`R2Trainer::new`].
-    pub fn with(gpu: &Gpu, data: R2Data, config: &Config, state: &R2State, step: u32) -> Result<R2Trainer> {
-        config.check()?;
+    pub fn with(gpu: &Gpu, data: R2Data, config: &Config<R2Settings>, state: &R2State, step: u32) -> Result<R2Trainer> {
         let mut config = config.clone();
         config.r2.max_num_gaussians = config.r2.max_num_gaussians.min(max_of_set(gpu, &data));
         let config = &config;
@@ -211,7 +211,7 @@ fn check_count(state: &R2State, data: &R2Data) -> Result<u32> {
 fn buffers(
     gpu: &Gpu,
     data: &R2Data,
-    config: &Config,
+    config: &Config<R2Settings>,
     (setup, r2, pictures): R2Setups<'_>,
     step: u32,
 ) -> Result<R2Buffers> {

@@ -1,6 +1,7 @@
 //! Buffers of SAX-NeRF on a device, and a check of the memory that a fit takes.
 
 use crate::config::Config;
+use crate::config::sections::SaxSettings;
 use crate::error::{Error, Result};
 use crate::fitting::ring::ring;
 use crate::fitting::sets::seed_of_set;
@@ -52,7 +53,7 @@ impl SaxMemory {
     ///
     /// # Errors
     /// [`Error::Config`] naming the setting to lower; [`Error::OutOfMemory`] where other programs hold the memory.
-    pub fn check(&self, gpu: &Gpu, config: &Config, n_sets: usize) -> Result<()> {
+    pub fn check(&self, gpu: &Gpu, config: &Config<SaxSettings>, n_sets: usize) -> Result<()> {
         let (sax, info) = (&config.sax, gpu.info());
         let largest = u64::from(info.max_storage_buffer_range);
         let mib = |bytes: u64| bytes.div_ceil(MIB);
@@ -158,13 +159,13 @@ pub fn fit_buffers(
     data: &SaxData,
     field: &SaxField,
     setup: &SaxSetup,
-    config: &Config,
+    config: &Config<SaxSettings>,
 ) -> Result<SaxFitBuffers> {
     let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
     let [rays, samples, weights, grid] =
         [setup.n_rays, setup.n_rays * setup.n_samples, setup.n_weights, setup.n_grid].map(u64::from);
     let fit = SaxFitBuffers {
-        setup: gpu.buffer_with("setup", &[adam_setup(field.shape, config)])?,
+        setup: gpu.buffer_with("setup", &[adam_setup(field.shape)])?,
         schedule: gpu.buffer_with("schedule", &schedule(config))?,
         sax_turns: gpu.buffer_with("sax_turns", &data.turns().0)?,
         sax_views: gpu.buffer_with("sax_views", &data.views)?,
@@ -222,7 +223,7 @@ mod tests {
 
     #[test]
     fn the_published_field_fits_the_buffers_of_every_device() {
-        let sax = Config::preset(Preset::SaxNerf).sax;
+        let sax = Config::preset(Preset::SaxNerf).of::<crate::config::sections::SaxSettings>().unwrap().method.sax;
         let shape = SaxShape::of(&sax);
         let n_rays = sax.windows * sax.window * sax.window + sax.rays;
         let setup = SaxSetup {

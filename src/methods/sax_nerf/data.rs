@@ -47,7 +47,7 @@ impl SaxData {
     pub fn new(dataset: &Dataset, settings: &Sax, half: f64) -> Result<SaxData> {
         check_sizes(dataset, "SAX-NeRF")?;
         check_windows(settings, [dataset.width, dataset.height])?;
-        let attenuation = dataset.vessel_attenuation.filter(|_| settings.normalise).unwrap_or(1.0);
+        let attenuation = dataset.vessel_attenuation.unwrap_or(1.0);
         let (training, n_pixels) = (dataset.training(), dataset.n_pixels());
         let mut data = SaxData {
             half,

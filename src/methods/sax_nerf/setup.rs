@@ -2,11 +2,19 @@
 
 use crate::config::Config;
 use crate::config::sections::Sax;
+use crate::config::sections::SaxSettings;
 use crate::fitting::{FIXED_POINT_BITS, RING_LENGTH};
 use crate::kernels::layout::{FieldUpdate, SaxSetup, Schedule, Setup};
 use crate::methods::sax_nerf::data::SaxData;
 use crate::methods::sax_nerf::field::{SaxField, SaxShape};
 use crate::methods::sax_nerf::lineformer::{PART_SAMPLES, chunks};
+
+/// Learning rate after its fall, as a share of the initial rate, as in the public code.
+const RATE_FALL: f64 = 0.1;
+/// Decay of Adam's first and second moments, as in the public code.
+const BETAS: [f64; 2] = [0.9, 0.999];
+/// Constant added to the denominator of Adam's update, as in the public code.
+pub(super) const EPSILON: f64 = 1e-8;
 
 /// Returns the constants of a field that do not depend on the target of drawing or fitting.
 fn field_setup(field: &SaxField) -> SaxSetup {
@@ -56,29 +64,29 @@ pub fn drawing_setup(field: &SaxField) -> SaxSetup {
 }
 
 /// Returns the constants of the optimiser, which treats all parameters as those of a static field.
-pub fn adam_setup(shape: SaxShape, config: &Config) -> Setup {
+pub fn adam_setup(shape: SaxShape) -> Setup {
     let n = shape.n_params() as u32;
     Setup {
         static_params: n,
         n_params: n,
-        beta1: config.adam.beta1 as f32,
-        beta2: config.adam.beta2 as f32,
-        epsilon: config.adam.epsilon as f32,
+        beta1: BETAS[0] as f32,
+        beta2: BETAS[1] as f32,
+        epsilon: EPSILON as f32,
         ..Setup::default()
     }
 }
 
 /// Returns one row per iteration and one more for an iteration that is timed after the end.
-pub fn schedule(config: &Config) -> Vec<Schedule> {
-    let (sax, adam) = (&config.sax, &config.adam);
+pub fn schedule(config: &Config<SaxSettings>) -> Vec<Schedule> {
+    let sax = &config.sax;
     let row = |step: u32| {
         let bias = |beta: f64| (1.0 - beta.powf(f64::from(step + 1))) as f32;
         let has_fallen = sax.rate_falls_at > 0 && step >= sax.rate_falls_at;
         let static_update = FieldUpdate {
-            rate: (sax.rate * if has_fallen { sax.rate_fall } else { 1.0 }) as f32,
+            rate: (sax.rate * if has_fallen { RATE_FALL } else { 1.0 }) as f32,
             restart: 0,
-            bias_correction1: bias(adam.beta1),
-            bias_correction2: bias(adam.beta2),
+            bias_correction1: bias(BETAS[0]),
+            bias_correction2: bias(BETAS[1]),
         };
         Schedule { static_update, ..Schedule::default() }
     };
@@ -106,7 +114,7 @@ mod tests {
 
     #[test]
     fn the_rate_falls_once_and_biases_count_updates() {
-        let config = Config::preset(Preset::SaxNerf);
+        let config = Config::preset(Preset::SaxNerf).of::<SaxSettings>().unwrap();
         let rows = schedule(&config);
         assert_eq!(rows.len(), 4504);
         assert_eq!((rows[0].static_update.rate, rows[4499].static_update.rate), (1e-3, 1e-3));

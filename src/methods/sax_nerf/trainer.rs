@@ -1,6 +1,7 @@
 //! Fits all fields of SAX-NeRF together: each iteration uses one image of each field.
 
 use crate::config::Config;
+use crate::config::sections::SaxSettings;
 use crate::error::{Error, Result};
 use crate::fitting::fit::{Advance, FieldFeed, Fit, FitField, FitProgress, Iterates, Measured, PendingFit, SavedFit};
 use crate::fitting::iterations::{Iterations, pass_times};
@@ -31,7 +32,7 @@ const CHUNK_PASSES: u32 = 40;
 pub struct SaxTrainer {
     gpu: Gpu,
     data: SaxData,
-    config: Config,
+    config: Config<SaxSettings>,
     /// The field without its parameters.
     outline: SaxField,
     setup: SaxSetup,
@@ -48,7 +49,7 @@ impl SaxTrainer {
     ///
     /// # Errors
     /// [`Error::Config`] for impossible settings, and for a device that has too little memory; device errors.
-    pub fn new(gpu: &Gpu, data: SaxData, config: &Config) -> Result<SaxTrainer> {
+    pub fn new(gpu: &Gpu, data: SaxData, config: &Config<SaxSettings>) -> Result<SaxTrainer> {
         let outline = outline(&data, &config.sax, 0);
         // The check comes before millions of random numbers are drawn.
         SaxMemory::of(&fit_setup(&outline, &data, &config.sax)).check(gpu, config, data.n_sets())?;
@@ -62,8 +63,13 @@ impl SaxTrainer {
     ///
     /// # Errors
     /// Errors of [`SaxTrainer::new`]; [`Error::Config`] for a field of other sizes.
-    pub fn with(gpu: &Gpu, data: SaxData, config: &Config, field: &SaxField, state: &SaxState) -> Result<SaxTrainer> {
-        config.check()?;
+    pub fn with(
+        gpu: &Gpu,
+        data: SaxData,
+        config: &Config<SaxSettings>,
+        field: &SaxField,
+        state: &SaxState,
+    ) -> Result<SaxTrainer> {
         let outline = outline(&data, &config.sax, field.step);
         let n = outline.shape.n_params();
         if field.shape != outline.shape

@@ -73,7 +73,7 @@ impl XData {
     /// place and no extent is stated.
     pub fn new(dataset: &Dataset, settings: &X, half: f64) -> Result<XData> {
         check_sizes(dataset, "X-Gaussian")?;
-        let unit = dataset.vessel_attenuation.filter(|_| settings.normalise).unwrap_or(1.0);
+        let unit = dataset.vessel_attenuation.unwrap_or(1.0);
         let max = if settings.clamp > 0.0 { settings.clamp } else { f64::INFINITY };
         let training = dataset.training();
         let (mut images, mut beyond) = (Vec::with_capacity(training.len() * dataset.n_pixels()), 0);
@@ -89,9 +89,9 @@ impl XData {
         let views: Vec<_> = training.iter().map(|f| SplatView::new(&dataset.views[f.view].rays, units)).collect();
         let extent_mm = if settings.extent_mm > 0.0 { settings.extent_mm } else { extent_of(&views) };
         if extent_mm <= 0.0 {
-            let problem = "the extent of the scene cannot be computed, because all views have the same source \
-                           position: it needs views from different directions";
-            return Err(Error::unmet("x.extent_mm", settings.extent_mm, problem));
+            let problem = "all views have the same source position, so that the scene has no extent: X-Gaussian needs views from \
+                           several positions";
+            return Err(Error::unmet("dataset", dataset.path.display(), problem));
         }
         Ok(XData {
             half_mm: half * MM_PER_UNIT,

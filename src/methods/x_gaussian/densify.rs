@@ -45,12 +45,11 @@ pub fn densified(before: &XState, n_sets: usize, settings: &X, extent_mm: f64, (
         after.append(split_ones.iter().map(of).collect(), sets(&split_ones));
     }
     let large_ones_go = settings.reset_every > 0 && step > settings.reset_every;
-    let stays = |(g, statistics): (&BlendGaussian, &XStatistics)| {
+    let stays = |g: &BlendGaussian| {
         let too_wide = g.scales().max_element() > settings.max_scale * extent_mm;
-        let too_large = settings.max_radius > 0.0 && f64::from(statistics.radius) > settings.max_radius;
-        g.shown_opacity() >= settings.min_opacity && !(large_ones_go && (too_wide || too_large))
+        g.shown_opacity() >= settings.min_opacity && !(large_ones_go && too_wide)
     };
-    after.retain(&after.rows.iter().zip(&after.statistics).map(stays).collect::<Vec<_>>());
+    after.retain(&after.rows.iter().map(stays).collect::<Vec<_>>());
     after.statistics = vec![XStatistics::default(); after.rows.len()];
     after
 }
@@ -96,7 +95,7 @@ mod tests {
     const AT: (u32, u32) = (1, 600);
 
     fn settings() -> X {
-        Config::preset(Preset::XGaussian).x
+        Config::preset(Preset::XGaussian).of::<crate::config::sections::XSettings>().unwrap().method.x
     }
 
     fn row(x: f32, scale_mm: f32, opacity: f64) -> BlendGaussian {
@@ -159,8 +158,6 @@ mod tests {
         assert_eq!(left(&settings(), 600), [0.0, 2.0]);
         assert_eq!(left(&settings(), 4200), [0.0]);
         assert_eq!(left(&X { reset_every: 0, ..settings() }, 4200), [0.0, 2.0], "nothing is ever reset");
-        assert_eq!(left(&X { max_radius: 20.0, ..settings() }, 600), [0.0, 2.0]);
-        assert!(left(&X { max_radius: 20.0, ..settings() }, 4200).is_empty());
         let full = X { max_gaussians: 2, ..settings() };
         assert_eq!(densified(&four(), 2, &full, EXTENT_MM, AT).rows, four().rows);
         let room_for_one = X { max_gaussians: 3, ..settings() };

@@ -2,6 +2,7 @@
 
 use crate::config::Config;
 use crate::config::sections::X;
+use crate::config::sections::XSettings;
 use crate::fitting::RING_LENGTH;
 use crate::fitting::sets::seed_of_set;
 use crate::gaussians::blending::{FIXED_POINT_BITS, NEAREST_MM, TILE};
@@ -9,6 +10,11 @@ use crate::gaussians::comparison::picture_parts;
 use crate::kernels::layout::{BlendSetup, GaussianSetup, PictureSetup, PictureTurn, XSchedule};
 use crate::methods::x_gaussian::data::XData;
 use crate::methods::x_gaussian::densify::{densifies, resets};
+
+/// Decay of Adam's first and second moments, as in the public code.
+const BETAS: [f64; 2] = [0.9, 0.999];
+/// Constant added to the denominator of Adam's update, as in the public code.
+const EPSILON: f64 = 1e-15;
 
 /// Rates of an intensity by the colours' degree, as shares of that of their first coefficients. A colour of degree d is
 /// one half plus the sum of (d + 1)^2 coefficients, each times a constant, whatever the direction, and each has Adam's
@@ -22,7 +28,7 @@ fn absolute_weight(settings: &X) -> f64 {
 }
 
 /// Constants that stages share with other fits of Gaussians.
-pub fn gaussian_setup(data: &XData, config: &Config) -> GaussianSetup {
+pub fn gaussian_setup(data: &XData, config: &Config<XSettings>) -> GaussianSetup {
     let n_sets = data.n_sets() as u32;
     let n_pixels = data.n_pixels() as u32;
     GaussianSetup {
@@ -33,9 +39,9 @@ pub fn gaussian_setup(data: &XData, config: &Config) -> GaussianSetup {
         fixed_point: 2f32.powi(FIXED_POINT_BITS),
         // Each set has its own loss; their mean is reported.
         loss_weight: (absolute_weight(&config.x) / f64::from(n_sets)) as f32,
-        beta1: config.adam.beta1 as f32,
-        beta2: config.adam.beta2 as f32,
-        epsilon: config.adam.epsilon as f32,
+        beta1: BETAS[0] as f32,
+        beta2: BETAS[1] as f32,
+        epsilon: EPSILON as f32,
         ring_length: RING_LENGTH,
         n_images: n_sets,
         image_stride: n_pixels.next_multiple_of(4),
@@ -68,8 +74,8 @@ fn intensity_share(settings: &X, step: u32) -> f64 {
 }
 
 /// One row per iteration, and one more for timing; positions are in mm, in a scene of `extent_mm`.
-pub fn schedule(config: &Config, extent_mm: f64) -> Vec<XSchedule> {
-    let (x, adam, n) = (&config.x, &config.adam, config.train.iterations);
+pub fn schedule(config: &Config<XSettings>, extent_mm: f64) -> Vec<XSchedule> {
+    let (x, n) = (&config.x, config.train.iterations);
     let mut updates = 0;
     let row = |step: u32| {
         let is_update = !densifies(x, step);
@@ -83,8 +89,8 @@ pub fn schedule(config: &Config, extent_mm: f64) -> Vec<XSchedule> {
             scale_rate: x.scale_rate as f32,
             intensity_rate: (x.intensity_rate * intensity_share(x, step)) as f32,
             rotation_rate: x.rotation_rate as f32,
-            bias1: bias(adam.beta1),
-            bias2: bias(adam.beta2),
+            bias1: bias(BETAS[0]),
+            bias2: bias(BETAS[1]),
             updates: u32::from(is_update),
         }
     };
@@ -92,7 +98,7 @@ pub fn schedule(config: &Config, extent_mm: f64) -> Vec<XSchedule> {
 }
 
 /// Turns of each set in each iteration of the schedule: an image, in an order that is drawn anew when all have been seen.
-pub fn turns(data: &XData, config: &Config) -> Vec<PictureTurn> {
+pub fn turns(data: &XData, config: &Config<XSettings>) -> Vec<PictureTurn> {
     let turn = |step: u32, set: usize| PictureTurn {
         image: data.sets.image_of_turn(set, seed_of_set(config.seed, set), step),
         ..PictureTurn::default()
@@ -124,7 +130,7 @@ mod tests {
 
     #[test]
     fn rates_fall_and_density_control_takes_no_step() {
-        let config = Config::preset(Preset::XGaussian);
+        let config = Config::preset(Preset::XGaussian).of::<XSettings>().unwrap();
         let rows = schedule(&config, 437.0);
         assert_eq!(rows.len(), 20_001);
         let close = |got: f32, want: f64| assert!((f64::from(got) / want - 1.0).abs() < 1e-5, "{got} {want}");
@@ -136,7 +142,8 @@ mod tests {
         close(rows[19_000].intensity_rate, 0.002 * RATES_BY_DEGREE[3]);
         assert_eq!((rows[3998].opacity_rate > 0.0, rows[3999].opacity_rate), (true, 0.0));
         close(rows[700].bias2, 1.0 - 0.999f64.powi(700));
-        let steady = Config { x: X { degree_every: 0, ..config.x.clone() }, ..config };
+        let mut steady = config;
+        steady.x.degree_every = 0;
         close(schedule(&steady, 1.0)[9000].intensity_rate, 0.002 * RATES_BY_DEGREE[0]);
     }
 }

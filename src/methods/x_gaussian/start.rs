@@ -1,6 +1,6 @@
 //! Start of a fit: voxel centres all over the volume ("angle-pose cuboid uniform initialisation").
 
-use crate::config::sections::X;
+use crate::config::sections::{FIRST_OPACITY, X};
 use crate::gaussians::blending::opacity::stored_opacity;
 use crate::gaussians::field::rotation_none;
 use crate::gaussians::spacing::spacings;
@@ -26,7 +26,7 @@ fn voxel_centres(settings: &X) -> Vec<DVec3> {
 /// away.
 pub fn first_state(data: &XData, settings: &X) -> XState {
     let centres = voxel_centres(settings);
-    let opacity = stored_opacity(settings.first_opacity.ln()) as f32;
+    let opacity = stored_opacity(FIRST_OPACITY.ln()) as f32;
     let row = |(x, spacing): (&DVec3, f64)| BlendGaussian {
         position: (*x * data.half_mm).as_vec3().to_array(),
         opacity,
@@ -47,7 +47,7 @@ mod tests {
 
     #[test]
     fn a_fit_begins_at_every_eighth_voxel() {
-        let settings = Config::preset(Preset::XGaussian).x;
+        let settings = Config::preset(Preset::XGaussian).of::<crate::config::sections::XSettings>().unwrap().method.x;
         let centres = voxel_centres(&settings);
         assert_eq!(centres.len(), 32 * 32 * 32);
         assert!((centres[0] - DVec3::splat(0.5 / 128.0 - 1.0)).length() < 1e-12);

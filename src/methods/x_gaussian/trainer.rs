@@ -1,6 +1,7 @@
 //! Fits Gaussians as X-Gaussian does: all sets at once, one view each per iteration, and density control on the host.
 
 use crate::config::Config;
+use crate::config::sections::XSettings;
 use crate::error::{Error, Result};
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::ring::{counts_wrongly, losses, ring};
@@ -41,7 +42,7 @@ const BYTES_PER_GAUSSIAN: u64 = 2 * 48 + 8 * 3 * 8;
 pub struct XTrainer {
     gpu: Gpu,
     data: XData,
-    config: Config,
+    config: Config<XSettings>,
     setup: GaussianSetup,
     x: BlendSetup,
     kernels: XKernels,
@@ -60,7 +61,7 @@ impl XTrainer {
     ///
     /// # Errors
     /// [`Error::Config`] for impossible settings; device errors.
-    pub fn new(gpu: &Gpu, data: XData, config: &Config) -> Result<(XTrainer, Vec<String>)> {
+    pub fn new(gpu: &Gpu, data: XData, config: &Config<XSettings>) -> Result<(XTrainer, Vec<String>)> {
         let state = first_state(&data, &config.x);
         let (max, mut notes) = (max_of_set(gpu, &data), Vec::new());
         if max < config.x.max_gaussians {
@@ -77,8 +78,7 @@ impl XTrainer {
     ///
     /// # Errors
     /// As [`XTrainer::new`].
-    pub fn with(gpu: &Gpu, data: XData, config: &Config, state: &XState, step: u32) -> Result<XTrainer> {
-        config.check()?;
+    pub fn with(gpu: &Gpu, data: XData, config: &Config<XSettings>, state: &XState, step: u32) -> Result<XTrainer> {
         let mut config = config.clone();
         config.x.max_gaussians = config.x.max_gaussians.min(max_of_set(gpu, &data));
         let n = check_count(state, &data, config.x.min_opacity)?;
@@ -314,7 +314,7 @@ fn check_count(state: &XState, data: &XData, weakest: f64) -> Result<u32> {
 fn scene_buffers(
     gpu: &Gpu,
     data: &XData,
-    config: &Config,
+    config: &Config<XSettings>,
     (setup, x): (&GaussianSetup, &BlendSetup),
     step: u32,
 ) -> Result<BlendBuffers> {
@@ -336,7 +336,7 @@ fn scene_buffers(
     })
 }
 
-fn fit_buffers(gpu: &Gpu, data: &XData, config: &Config, setup: &GaussianSetup) -> Result<XFitBuffers> {
+fn fit_buffers(gpu: &Gpu, data: &XData, config: &Config<XSettings>, setup: &GaussianSetup) -> Result<XFitBuffers> {
     let fill = vec![0.0; setup.image_stride as usize - data.n_pixels()];
     let targets: Vec<f32> =
         data.images.chunks(data.n_pixels()).flat_map(|image| image.iter().chain(&fill)).copied().collect();

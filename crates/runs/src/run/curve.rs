@@ -3,6 +3,8 @@
 use crate::config::Config;
 use crate::scan::dataset::{Dataset, Frame, View};
 
+/// Validation images used during training; evenly spread over all of them.
+pub(super) const VALIDATION_IMAGES: usize = 8;
 /// Largest share of a network's evaluations in training that validation may add.
 const LARGEST_SHARE: f64 = 0.1;
 /// Evaluations of a sample in an iteration: forward once, backward for weights and inputs.
@@ -14,12 +16,11 @@ const LEAST_SIDE: usize = 32;
 /// evaluated for all pixels more often than training allows.
 pub(super) fn validation_step(config: &Config, dataset: &Dataset) -> usize {
     let every = config.train.validate_every;
-    if every == 0 || config.hull.enabled || !config.method().has_network() {
-        return 1;
-    }
-    let images = dataset.validation().len().min(config.train.validate_images as usize);
-    let validation = (images * dataset.n_pixels()) as f64 * f64::from(config.march.render_samples);
-    let samples = f64::from(every) * f64::from(config.train.rays) * f64::from(config.march.dynamic_samples);
+    let unconfined = config.fields().filter(|settings| settings.network.is_some() && !settings.has_hull);
+    let Some(settings) = unconfined.filter(|_| every > 0) else { return 1 };
+    let images = dataset.validation().len().min(VALIDATION_IMAGES);
+    let validation = (images * dataset.n_pixels()) as f64 * f64::from(settings.render_samples);
+    let samples = f64::from(every) * f64::from(settings.rays) * f64::from(settings.march.dynamic_samples);
     let step = (validation / (LARGEST_SHARE * PASSES_OF_TRAINING * samples)).sqrt().ceil();
     let most = (dataset.width.min(dataset.height) / LEAST_SIDE).max(1);
     (step as usize).clamp(1, most)

@@ -18,7 +18,7 @@ use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
 use crate::methods;
 use crate::plan::Plan;
-use crate::run::curve::{thinned, validation_step};
+use crate::run::curve::{VALIDATION_IMAGES, thinned, validation_step};
 use crate::run::events::Event;
 use crate::run::log::MetricsLog;
 use crate::run::snapshots::{Answer, Job, SnapshotWorker};
@@ -146,7 +146,7 @@ pub fn reconstruct(
         tuning: options.tuning,
         run: options.run,
         dataset: thin.as_ref().unwrap_or(dataset),
-        validation: eval::spread_validation(thin.as_ref().unwrap_or(dataset), config.train.validate_images as usize),
+        validation: eval::spread_validation(thin.as_ref().unwrap_or(dataset), VALIDATION_IMAGES),
         distance,
         begin,
         cancel: options.cancel,

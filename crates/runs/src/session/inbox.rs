@@ -1,6 +1,6 @@
 //! Frames of a session, as they came.
 
-use crate::config::{Config, DynamicTarget};
+use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT};
 use crate::methods;
@@ -253,7 +253,7 @@ impl Inbox {
 
     /// Tells whether the dynamic field is found by what changes over the beat, so that a view needs two phases.
     fn is_temporal(&self) -> bool {
-        self.options.config.loss.dynamic_target == DynamicTarget::Temporal
+        self.options.config.is_temporal()
     }
 
     /// Returns the time in the beat of a moment, where that is known.

@@ -52,7 +52,7 @@ pub fn model(gpu: &Gpu, dataset: &Dataset, field: GaussianField, tuning: &Tuning
     let config = Config::preset(Preset::default());
     let param_map = ParamMap::new(&config, dataset.n_phases as usize);
     Ok(Model {
-        params: param_map.initial(&config),
+        params: param_map.initial(config.seed),
         param_map,
         config,
         gaussians: Some(field),

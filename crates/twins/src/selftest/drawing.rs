@@ -61,8 +61,8 @@ impl Trained {
         let plan = Plan::new(&config, &dataset)?.in_scene(model.scene.clone());
         let mut plan = plan.data::<FieldData>()?.clone();
         plan.setup.jitter = 0;
-        plan.setup.n_static_samples = config.march.render_samples;
-        plan.setup.n_dynamic_samples = config.march.render_samples;
+        plan.setup.n_static_samples = config.render.render_samples;
+        plan.setup.n_dynamic_samples = config.render.render_samples;
         let params = model.params.iter().map(|v| f64::from(*v)).collect();
         let precision = match tuning.layers {
             Layers::F32 => Precision::Exact,

@@ -1,6 +1,5 @@
 //! Gaussians, a set per phase: an iteration of their fit, stage by stage, and the optimiser over ten.
 
-use crate::config::{Config, Preset, sections};
 use crate::error::Result;
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::TargetBuffers;
@@ -12,7 +11,7 @@ use crate::methods::dynamic_gaussians::setup;
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::reference::gaussians::{self as reference, N_PARAMS, Params, Projection, params};
 use crate::selftest::compare::{Findings, Tolerance, told};
-use crate::selftest::problems::{hard_case, with_gaussians};
+use crate::selftest::problems::{default_rules, hard_case};
 
 const PROJECT: &[&str] = &[push::GaussianProject::SHADER];
 pub(crate) const SPLAT: &[&str] = &[push::GaussianSplat::SHADER];
@@ -196,7 +195,7 @@ pub(crate) fn compare_backward(
 pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     findings.begin("phase", "77 Gaussians, 8 images of 33 x 27 pixels");
     let (targets, rows) = hard_case()?;
-    let preset = Config::preset(Preset::default());
+    let preset = default_rules()?;
     let mut trainer = GaussianTrainer::with(gpu, targets.clone(), &preset, &Particles::fresh(rows.clone()))?;
     let setup = *trainer.setup();
     let all: Vec<(Params, usize)> = rows.iter().map(|g| (params(g), g.phase as usize)).collect();
@@ -243,8 +242,8 @@ pub(crate) fn compare_gradient(got: &[Params], want: &[Params], stages: &[&'stat
 fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     findings.begin("phase", "77 Gaussians, ten updates");
     let (targets, rows) = hard_case()?;
-    let settings = sections::Gaussians { iterations: 12, ..Config::preset(Preset::default()).gaussians };
-    let config = with_gaussians(settings);
+    let mut config = default_rules()?;
+    config.gaussians.iterations = 12;
     let mut trainer = GaussianTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
     while trainer.step() < 10 {
         trainer.advance(10)?;

@@ -229,7 +229,7 @@ pub(super) fn samples(gpu: &Gpu, fit: &FieldsFit, live: usize) -> Result<Vec<Sam
 pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
     findings.begin(path_name(tuning.layers), &case.name());
     let plan = case.plan(dataset)?;
-    let mut params = plan.params.initial(&plan.config);
+    let mut params = plan.params.initial(plan.config.seed);
     if tuning.layers == Layers::F32 {
         // Larger planes and lines than the default start, so that static gradients are not tiny products.
         params[..plan.params.static_len].iter_mut().for_each(|p| *p *= 30.0);

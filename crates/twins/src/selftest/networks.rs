@@ -136,7 +136,7 @@ struct Twin<'a> {
 pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
     findings.begin(path_name(tuning.layers), &case.name());
     let mut trainer = Trainer::new(gpu, case.plan(dataset)?, dataset, tuning.clone())?;
-    let mut params = trainer.fields()?.data().params.initial(&trainer.fields()?.data().config);
+    let mut params = trainer.fields()?.data().params.initial(trainer.plan().config.seed);
     let mut moments = vec![[0f32; 2]; params.len()];
     for _ in 0..ITERATIONS {
         let step = trainer.step();

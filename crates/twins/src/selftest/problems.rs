@@ -1,6 +1,5 @@
 //! Problems small enough for f64 twins: configurations and Gaussians that need no file.
 
-use crate::config::sections::{self, Deformable};
 use crate::config::{Config, Preset};
 use crate::error::Result;
 use crate::gaussians::field::{GaussianField, Gaussians, MovingGaussians, Units};
@@ -8,6 +7,7 @@ use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry};
 use crate::kernels::layout::{Gaussian, GaussianSetup, MotionGridSetup};
 use crate::methods::dynamic_gaussians::lengths::Lengths;
+use crate::methods::dynamic_gaussians::rules::{DeformableRules, GaussianRules, Rules};
 use crate::methods::dynamic_gaussians::shared_images::SharedImages;
 use crate::methods::dynamic_gaussians::targets::{PossibleVessel, Targets};
 use crate::random::{STREAM_JITTER, normal};
@@ -46,8 +46,34 @@ pub fn small_config(preset: Preset, settings: &[&str]) -> Result<Config> {
     ];
     let config = Config::preset(preset);
     let acts = |setting: &&&str| setting.split_once('=').is_some_and(|(key, _)| config.acts(key));
-    let all = small.iter().filter(acts).chain(settings);
-    config.with_constants(&all.map(|setting| (*setting).to_owned()).collect::<Vec<String>>())
+    with_values(&config, small.iter().filter(acts).chain(settings).copied())
+}
+
+/// Returns a configuration with other recorded values, whether users may change them or not: `section.name=value`, as TOML writes them.
+///
+/// # Errors
+/// [`Error::Config`] for a value that is not usable.
+pub fn with_values<'a>(config: &Config, values: impl IntoIterator<Item = &'a str>) -> Result<Config> {
+    let internal = |e: &dyn std::fmt::Display| Error::Internal(e.to_string());
+    let mut table = toml::Table::try_from(config).map_err(|e| internal(&e))?;
+    for text in values {
+        let unknown = || Error::config("setting", text, "is not `section.name=value` with a recorded value");
+        let (key, value) = text.split_once('=').ok_or_else(unknown)?;
+        let slot = match key.split_once('.') {
+            None => table.get_mut(key),
+            Some((section, name)) => table.get_mut(section).and_then(|section| section.get_mut(name)),
+        };
+        let slot = slot.ok_or_else(unknown)?;
+        *slot = match slot {
+            toml::Value::String(_) => value.into(),
+            toml::Value::Float(_) => value.parse::<f64>().map_err(|e| internal(&e))?.into(),
+            toml::Value::Integer(_) => value.parse::<i64>().map_err(|e| internal(&e))?.into(),
+            _ => (value == "true").into(),
+        };
+    }
+    let config: Config = table.try_into().map_err(|e: toml::de::Error| internal(&e))?;
+    config.check()?;
+    Ok(config)
 }
 
 /// Gaussians of all shapes within `reach` pixels of the isocentre.
@@ -138,16 +164,19 @@ pub fn hard_case() -> Result<(Targets, Vec<Gaussian>)> {
     Ok((targets, rows))
 }
 
-/// Default configuration with the given settings of Gaussians.
-pub fn with_gaussians(gaussians: sections::Gaussians) -> Config {
-    Config { gaussians, ..Config::preset(Preset::default()) }
+/// Numbers of the default fit of Gaussians.
+///
+/// # Errors
+/// [`Error::Internal`] where the default preset fits no Gaussians.
+pub fn default_rules() -> Result<Rules> {
+    Ok(Rules::of(&Config::preset(Preset::default()).of()?))
 }
 
 /// A deformable set's targets, Gaussians and settings.
 ///
 /// # Errors
 /// As [`targets`].
-pub fn deformable_case() -> Result<(Targets, Vec<Gaussian>, Config)> {
+pub fn deformable_case() -> Result<(Targets, Vec<Gaussian>, Rules)> {
     let mut targets = targets(33, 27, 5)?;
     // Some images were taken between two phases.
     targets
@@ -161,10 +190,10 @@ pub fn deformable_case() -> Result<(Targets, Vec<Gaussian>, Config)> {
     targets.places[0].push(corner);
     let mut rows = random_gaussians(31, 1, 11.0, 8);
     rows[3].position = [300.0, 0.0, 0.0];
-    let preset = Config::preset(Preset::default());
-    let deformable = Deformable { node: 12.0, smoothness: 0.5, own_penalty: 0.7, ..preset.deformable };
-    let gaussians = sections::Gaussians { grow_at: 0, ..preset.gaussians.clone() };
-    Ok((targets, rows, Config { deformable, gaussians, ..preset }))
+    let preset = default_rules()?;
+    let deformable = DeformableRules { node: 12.0, smoothness: 0.5, own_penalty: 0.7, ..preset.deformable };
+    let gaussians = GaussianRules { grow_at: 0, ..preset.gaussians.clone() };
+    Ok((targets, rows, Rules { deformable, gaussians, ..preset }))
 }
 
 /// A deformable set that already moves: Gaussians at rest, own motion, and a grid filled with waves where it does not rest.

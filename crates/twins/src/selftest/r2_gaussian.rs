@@ -1,6 +1,7 @@
 //! R2-Gaussian: an iteration of its fit, stage by stage, each on what the device made for it, and the optimiser over
 //! ten.
 
+use crate::config::sections::R2Settings;
 use crate::config::{Config, Preset};
 use crate::error::Result;
 use crate::fitting::shown::SetsFit;
@@ -20,6 +21,7 @@ use crate::reference::ssim;
 use crate::scan::small::small_dataset;
 use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::{TENSORS, f32s, numbers, of_rows};
+use crate::selftest::problems::with_values;
 use glam::DVec3;
 
 const PROJECT: &[&str] = &[push::R2Project::SHADER];
@@ -56,7 +58,7 @@ const UPDATES: u32 = 10;
 ///
 /// # Errors
 /// [`crate::error::Error::Config`] for a setting that is not usable.
-pub fn small_config(settings: &[&str]) -> Result<Config> {
+pub fn small_config(settings: &[&str]) -> Result<Config<R2Settings>> {
     let small = [
         "train.iterations=40",
         "train.iterations_per_submit=4",
@@ -65,8 +67,7 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
         "r2.tv_vol_size=7",
         "r2.densification_interval=0",
     ];
-    let all: Vec<String> = small.iter().chain(settings).map(|setting| (*setting).to_owned()).collect();
-    Config::preset(Preset::R2Gaussian).with_constants(&all)
+    with_values(&Config::preset(Preset::R2Gaussian), small.iter().chain(settings).copied())?.of()
 }
 
 /// Data and Gaussians that kernels are compared on: sizes that are no multiples of anything; centres in view, outside
@@ -74,9 +75,9 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
 ///
 /// # Errors
 /// As [`small_dataset`] and [`Plan::new`].
-pub fn hard_case(config: &Config) -> Result<(R2Data, Vec<R2Gaussian>)> {
+pub fn hard_case(config: &Config<R2Settings>) -> Result<(R2Data, Vec<R2Gaussian>)> {
     let dataset = small_dataset(33, 27, 3)?;
-    let plan = Plan::new(config, &dataset)?;
+    let plan = Plan::new(&config.clone().into_any(), &dataset)?;
     let data = plan.data::<R2Data>()?.clone();
     let value = |i: u32, k: u32| normal(9, STREAM_JITTER, i, k);
     let n_sets = data.n_sets() as u32;
@@ -181,7 +182,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
 /// A fit before its first iteration.
 struct Iteration<'a> {
     gpu: &'a Gpu,
-    config: Config,
+    config: Config<R2Settings>,
     fit: R2Trainer,
     rows: Vec<R2Gaussian>,
 }
@@ -421,7 +422,8 @@ fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     let (data, mut rows) = hard_case(&config)?;
     // Only Gaussians that density control keeps.
     rows.retain(|g| g.position.iter().all(|x| x.abs() < 0.95) && g.density > -9.0);
-    let settings = Config { r2: crate::config::sections::R2 { densify_gradient: 1e6, ..config.r2.clone() }, ..config };
+    let mut settings = config;
+    settings.r2.densify_gradient = 1e6;
     let mut fit = R2Trainer::with(gpu, data, &settings, &R2State::fresh(rows.clone()), 0)?;
     while fit.step() < UPDATES {
         fit.advance(UPDATES)?;

@@ -1,6 +1,7 @@
 //! SAX-NeRF: an iteration of its fit, stage by stage, each on what the device made for it; and what is drawn of a
 //! field.
 
+use crate::config::sections::SaxSettings;
 use crate::config::{Config, Preset};
 use crate::error::Result;
 use crate::fitting::sets::seed_of_set;
@@ -12,7 +13,7 @@ use crate::kernels::push::{self, PushConstants};
 use crate::methods::sax_nerf::data::SaxData;
 use crate::methods::sax_nerf::drawing::SaxDrawing;
 use crate::methods::sax_nerf::field::{SaxField, SaxState};
-use crate::methods::sax_nerf::setup::{drawing_setup, outline, schedule};
+use crate::methods::sax_nerf::setup::{EPSILON, drawing_setup, outline, schedule};
 use crate::methods::sax_nerf::start::first_params;
 use crate::methods::sax_nerf::trainer::SaxTrainer;
 use crate::model::field::{FieldDrawing, Row};
@@ -21,6 +22,7 @@ use crate::random::{STREAM_JITTER, normal};
 use crate::reference::sax_nerf::{self as reference, Lineformer};
 use crate::scan::small::small_dataset;
 use crate::selftest::compare::{Findings, Tolerance, told};
+use crate::selftest::problems::with_values;
 
 const BATCH: &[&str] = &[push::SaxBatch::SHADER];
 const POINTS: &[&str] = &[push::SaxPoints::SHADER];
@@ -55,7 +57,7 @@ const PATHS: Tolerance = Tolerance::OfLargest(1e-4);
 ///
 /// # Errors
 /// [`crate::error::Error::Config`] for a setting that is not usable.
-pub fn small_config(settings: &[&str]) -> Result<Config> {
+pub fn small_config(settings: &[&str]) -> Result<Config<SaxSettings>> {
     let small = [
         "train.iterations=40",
         "train.iterations_per_submit=4",
@@ -69,17 +71,16 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
         "sax.bound_mm=60",
         "sax.lrate_step=30",
     ];
-    let all: Vec<String> = small.iter().chain(settings).map(|setting| (*setting).to_owned()).collect();
-    Config::preset(Preset::SaxNerf).with_constants(&all)
+    with_values(&Config::preset(Preset::SaxNerf), small.iter().chain(settings).copied())?.of()
 }
 
 /// Data, and fields without special values: a grid and normalisations that have an effect.
 ///
 /// # Errors
 /// As [`small_dataset`] and [`Plan::new`].
-pub fn hard_case(config: &Config) -> Result<(SaxData, SaxField, SaxState)> {
+pub fn hard_case(config: &Config<SaxSettings>) -> Result<(SaxData, SaxField, SaxState)> {
     let dataset = small_dataset(33, 27, 3)?;
-    let data = Plan::new(config, &dataset)?.data::<SaxData>()?.clone();
+    let data = Plan::new(&config.clone().into_any(), &dataset)?.data::<SaxData>()?.clone();
     let outline = outline(&data, &config.sax, 0);
     let parts = outline.shape.parts();
     let params = |set: usize| {
@@ -129,7 +130,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
 /// A fit before its first iteration, of whose fields the last one's is left in the buffers.
 struct Iteration<'a> {
     gpu: &'a Gpu,
-    config: Config,
+    config: Config<SaxSettings>,
     fit: SaxTrainer,
     field: SaxField,
 }
@@ -279,12 +280,12 @@ impl Iteration<'_> {
 
     /// Compares the first update, from the gradient that the device found.
     fn compare_update(&self, findings: &mut Findings) -> Result<()> {
-        let (adam, row) = (&self.config.adam, schedule(&self.config)[0]);
+        let row = schedule(&self.config)[0];
         let n = self.field.shape.n_params();
         let gradient = f64s(&self.floats(&self.fit.buffers().1.gradient, n)?);
         let after = f64s(&self.floats(&self.fit.sets()[self.last_set()].params, n)?);
         let moved: Vec<f32> = after.iter().zip(&self.params()).map(|(a, b)| (a - b) as f32).collect();
-        let step = |g: &f64| -f64::from(row.static_update.rate) * g / (g.abs() + adam.epsilon);
+        let step = |g: &f64| -f64::from(row.static_update.rate) * g / (g.abs() + EPSILON);
         // Numbers are near 1 and steps are 0.001 of that.
         findings.numbers(
             ADAM,

@@ -1,6 +1,7 @@
 //! X-Gaussian: an iteration of its fit, stage by stage, each on what the device made for it, the order of more
 //! Gaussians than a block of the sort holds, and the optimiser over ten iterations.
 
+use crate::config::sections::XSettings;
 use crate::config::{Config, Preset};
 use crate::error::Result;
 use crate::fitting::shown::SetsFit;
@@ -21,6 +22,7 @@ use crate::reference::x_gaussian::{self as reference, Blot, N_PARAMS, Params, Pr
 use crate::scan::small::small_dataset;
 use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::f32s;
+use crate::selftest::problems::with_values;
 use glam::DVec2;
 use std::ops::Range;
 
@@ -63,7 +65,7 @@ pub const TENSORS: [(&str, Range<usize>); 5] =
 ///
 /// # Errors
 /// [`crate::error::Error::Config`] for a setting that is not usable.
-pub fn small_config(settings: &[&str]) -> Result<Config> {
+pub fn small_config(settings: &[&str]) -> Result<Config<XSettings>> {
     let small = [
         "train.iterations=40",
         "train.iterations_per_submit=4",
@@ -72,13 +74,12 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
         "x.densification_interval=0",
         "x.opacity_reset_interval=0",
     ];
-    let all: Vec<String> = small.iter().chain(settings).map(|setting| (*setting).to_owned()).collect();
-    Config::preset(Preset::XGaussian).with_constants(&all)
+    with_values(&Config::preset(Preset::XGaussian), small.iter().chain(settings).copied())?.of()
 }
 
-fn data_of(config: &Config, width: usize, height: usize) -> Result<XData> {
+fn data_of(config: &Config<XSettings>, width: usize, height: usize) -> Result<XData> {
     let dataset = small_dataset(width, height, 3)?;
-    Ok(Plan::new(config, &dataset)?.data::<XData>()?.clone())
+    Ok(Plan::new(&config.clone().into_any(), &dataset)?.data::<XData>()?.clone())
 }
 
 /// `n` Gaussians all over the volume, some so far beyond it that views look past them.
@@ -102,7 +103,7 @@ fn anywhere(data: &XData, n: u32) -> XState {
 ///
 /// # Errors
 /// As [`small_dataset`] and [`Plan::new`].
-pub fn hard_case(config: &Config) -> Result<(XData, XState)> {
+pub fn hard_case(config: &Config<XSettings>) -> Result<(XData, XState)> {
     let data = data_of(config, 37, 27)?;
     let mut state = anywhere(&data, 97);
     let (half, rows) = (data.half_mm as f32, &mut state.rows);
@@ -488,7 +489,7 @@ fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
 }
 
 /// Rates of [`TENSORS`] at the start.
-fn rates(config: &Config, extent_mm: f64) -> [f64; 5] {
+fn rates(config: &Config<XSettings>, extent_mm: f64) -> [f64; 5] {
     let x = &config.x;
     [extent_mm * x.position_rate, x.opacity_rate, x.scale_rate, x.intensity_rate, x.rotation_rate]
 }

@@ -1,20 +1,7 @@
-//! Choices of a configuration by name: representations of the fields, data of a fit, regions of losses, corrections.
+//! Choices of a configuration by name: forms of Gaussians, data of a fit, regions of losses, corrections.
 
 use serde::{Deserialize, Serialize};
 use strum::{IntoStaticStr, VariantArray};
-
-/// Representation of the dynamic field where it does not consist of Gaussians.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
-#[serde(rename_all = "kebab-case")]
-#[strum(serialize_all = "kebab-case")]
-pub enum DynamicForm {
-    /// A network on encoded coordinates and latents.
-    #[default]
-    Network,
-    /// A hash grid and a Lineformer as SAX-NeRF fits them to whole images, for each phase or for all phases, without a static
-    /// field.
-    Lineformer,
-}
 
 /// Region of the rays in which occlusion minimisation penalises the dynamic field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
@@ -29,20 +16,6 @@ pub enum OcclusionRegion {
     LastRay,
 }
 
-/// Representation of the static field.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
-#[serde(rename_all = "kebab-case")]
-#[strum(serialize_all = "kebab-case")]
-pub enum StaticForm {
-    /// Planes and lines.
-    #[default]
-    Tensor,
-    /// A network like that of the dynamic field, but without latents; the attenuations of both are added at the same samples.
-    Network,
-    /// No static field: the model consists of the dynamic field alone.
-    None,
-}
-
 /// Course of a learning rate from its start value to its end value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -53,13 +26,11 @@ pub enum Decay {
     Exponential,
 }
 
-/// Representation of the dynamic field.
+/// Form of the Gaussians of the preset `fast`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
 pub enum GaussianForm {
-    /// The network, without Gaussians.
-    None,
     /// A separate set of Gaussians per phase; the sets share nothing.
     Phase,
     /// One set of Gaussians that moves over the beat.
@@ -67,11 +38,6 @@ pub enum GaussianForm {
     Deformable,
     /// `Deformable` where the data allow it, otherwise `Phase`.
     Auto,
-    /// Static sets as R2-Gaussian fits them to whole images, one per phase or one for all phases, without a static field.
-    R2,
-    /// Static sets as X-Gaussian fits them to normalised images, without a static field; nearer Gaussians hide those behind
-    /// them.
-    X,
 }
 
 /// Images of a moving object to which a static method is fitted.
