@@ -240,14 +240,14 @@ fn views_that_agree_are_not_adjusted() {
     assert_eq!(error_px(&shot, &before), error_px(&shot, &after));
     expect_taken_over(&gpu, &after, &made);
     let other = MadeGaussians { fingerprint: "of other data".into(), ..made };
-    let plan = Plan::new(&fast(), &after).unwrap();
+    let plan = Plan::new(&fast().into_any(), &after).unwrap();
     let trainer = Trainer::prepared(&gpu, plan, &after, tuning(&gpu), made_before(&other)).unwrap();
     assert!(trainer.preparation().is_some(), "the fit to other data is not taken over");
 }
 
 /// A session with the frames of a shot and default settings.
 pub fn session(gpu: &Gpu, shot: &Shot) -> Session {
-    session_with(gpu, shot, fast())
+    session_with(gpu, shot, fast().into_any())
 }
 
 fn session_with(gpu: &Gpu, shot: &Shot, config: Config) -> Session {
