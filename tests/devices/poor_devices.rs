@@ -7,7 +7,7 @@ use crate::shim;
 use crate::shim::Poor;
 use ash::vk;
 use nertca_vk::bench::peaks::peaks;
-use nertca_vk::config::{Config, Preset};
+use nertca_vk::config::Preset;
 use nertca_vk::error::Error;
 use nertca_vk::gaussians::particles::Particles;
 use nertca_vk::gpu::device::{Adoption, DeviceOptions, Gpu};

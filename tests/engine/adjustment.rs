@@ -242,14 +242,14 @@ fn views_that_agree_are_not_adjusted() {
     expect_taken_over(&gpu, &after, &made);
     let made: &MadeGaussians = made.downcast_ref().unwrap();
     let other: MadeFit = Arc::new(MadeGaussians { fingerprint: "of other data".into(), ..made.clone() });
-    let plan = Plan::new(&fast(), &after).unwrap();
+    let plan = Plan::new(&fast().into_any(), &after).unwrap();
     let trainer = Trainer::begin(&gpu, plan, &after, tuning(&gpu), made_before(&other)).unwrap();
     assert!(trainer.preparation().is_some(), "the fit to other data is not taken over");
 }
 
 /// A session with the frames of a shot and default settings.
 pub fn session(gpu: &Gpu, shot: &Shot) -> Session {
-    session_with(gpu, shot, fast())
+    session_with(gpu, shot, fast().into_any())
 }
 
 fn session_with(gpu: &Gpu, shot: &Shot, config: Config) -> Session {

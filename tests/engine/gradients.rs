@@ -16,7 +16,7 @@ fn plan(preset: &str, settings: &[&str]) -> FieldData {
 }
 
 fn start(plan: &FieldData) -> Vec<f64> {
-    let mut params: Vec<f64> = plan.params.initial(plan.config.seed).iter().map(|v| f64::from(*v)).collect();
+    let mut params: Vec<f64> = plan.params.initial(plan.settings.seed).iter().map(|v| f64::from(*v)).collect();
     if plan.params.static_network.is_none() {
         params[..plan.params.static_len].iter_mut().for_each(|p| *p *= 30.0);
     }

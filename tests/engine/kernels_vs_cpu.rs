@@ -70,7 +70,7 @@ fn rays_and_depths_match() {
     let plan = trainer.fields().unwrap().data();
     let got: Vec<Ray> = gpu.download(&trainer.fields().unwrap().forward().rays, 0, plan.setup.n_rays as usize).unwrap();
     let want = march::batch(plan, losses.last().unwrap().step - 1);
-    let params: Vec<f64> = plan.params.initial(plan.config.seed).iter().map(|v| f64::from(*v)).collect();
+    let params: Vec<f64> = plan.params.initial(plan.settings.seed).iter().map(|v| f64::from(*v)).collect();
     let mut live = 0;
     for (g, w) in got.iter().zip(&want) {
         let [(nearest, _), (beyond, share)] = w.shown;

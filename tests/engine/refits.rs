@@ -3,6 +3,7 @@
 
 use crate::common::{expect_silence, gpu, tuning};
 use nertca_vk::checkpoint::Checkpoint;
+use nertca_vk::choice::Choice;
 use nertca_vk::config::{Config, GaussianForm, Preset};
 use nertca_vk::fitting::fit::{FitField, Start, Use};
 use nertca_vk::gaussians::field::GaussianField;

@@ -1,6 +1,5 @@
 //! One set of Gaussians that moves over the beat: an iteration of its fit, stage by stage.
 
-use crate::config::{Config, Preset, sections};
 use crate::error::{Error, Result};
 use crate::gaussians::particles::Particles;
 use crate::gpu::buffer::Buffer;
@@ -13,6 +12,7 @@ use crate::kernels::stages::{Build, Stage};
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use crate::methods::dynamic_gaussians::filling::{FILLING_RATE, MIN_FILLING};
 use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
+use crate::methods::dynamic_gaussians::rules::{GaussianRules, Rules};
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::reference::dynamic_gaussians::{DeformableParams, loss_and_gradient, phases_shown, shown};
 use crate::reference::gaussians::{self as reference, N_PARAMS, Params};
@@ -20,7 +20,7 @@ use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::{
     LOSS, NUMBERS, REPORT, SPLAT, TwinSplat, compare_backward, compare_gradient, compare_splats, device_gradient, f32s,
 };
-use crate::selftest::problems::{deformable_case, fillings, hard_case, moving_set, with_gaussians};
+use crate::selftest::problems::{deformable_case, default_rules, fillings, hard_case, moving_set};
 use crate::selftest::repeats::{ITERATIONS, bits_of, compare_runs, losses};
 use glam::DVec3;
 
@@ -246,8 +246,11 @@ fn compare_guess(
 /// Device errors.
 pub fn compare_equal_runs(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     findings.begin("phase", "24 iterations, losses and Gaussians");
-    let settings = |config: Config| sections::Gaussians { iterations: ITERATIONS, grow_at: 0, ..config.gaussians };
-    let config = with_gaussians(settings(Config::preset(Preset::Fast)));
+    let short = |rules: Rules| {
+        let gaussians = GaussianRules { iterations: ITERATIONS, grow_at: 0, ..rules.gaussians };
+        Rules { gaussians, ..rules }
+    };
+    let config = short(default_rules()?);
     let (targets, rows) = hard_case()?;
     let run = |stops: &[u32]| -> Result<Vec<u64>> {
         let mut trainer = GaussianTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
@@ -257,7 +260,7 @@ pub fn compare_equal_runs(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     };
     compare_runs(run, findings)?;
     let (targets, rows, config) = deformable_case()?;
-    let config = Config { gaussians: settings(config.clone()), ..config };
+    let config = short(config);
     findings.begin("deformable", "24 iterations, losses, Gaussians and their motion");
     compare_equal_runs_of_one_set(gpu, &targets, &rows, &config, findings)?;
     findings.begin("deformable", "the same with contrast that comes and goes, and fillings");
@@ -269,7 +272,7 @@ fn compare_equal_runs_of_one_set(
     gpu: &Gpu,
     targets: &Targets,
     rows: &[Gaussian],
-    config: &Config,
+    config: &Rules,
     findings: &mut Findings,
 ) -> Result<()> {
     let run = |stops: &[u32]| -> Result<Vec<u64>> {
