@@ -197,12 +197,12 @@ pub fn dynamic_half(half_extent_mm: f64, dataset: &Dataset) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Config, Preset};
+    use crate::config::fields::Loss;
+    use crate::config::{Config, DynamicTarget, Preset};
     use crate::fields::motion::{Thresholds, analyse};
     use crate::geometry::Geometry;
     use crate::model::component::Component;
     use crate::scan::dataset::{Frame, Layout, Split, View};
-    use crate::selftest::problems::with_values;
 
     const SIZE: usize = 8;
 
@@ -253,9 +253,13 @@ mod tests {
         }
     }
 
-    fn normalised(dataset: &Dataset, settings: &[&str]) -> Result<Scene> {
-        let all = ["loss.normalise=true"].into_iter().chain(settings.iter().copied());
-        let settings = with_values(&Config::preset(Preset::Paper), all).unwrap().fields().unwrap();
+    /// Loss of a shared residual.
+    const ABSOLUTE: Loss = Loss { normalise: true, dynamic_target: DynamicTarget::Absolute, robust: 0.0 };
+    /// Loss of what changes over the beat.
+    const TEMPORAL: Loss = Loss { dynamic_target: DynamicTarget::Temporal, robust: 0.3, ..ABSOLUTE };
+
+    fn normalised(dataset: &Dataset, loss: Loss) -> Result<Scene> {
+        let settings = FieldSettings { loss, ..Config::preset(Preset::Paper).fields().unwrap() };
         Scene::new(&settings, dataset, &analyse(dataset, Thresholds::default()), None)
     }
 
@@ -266,7 +270,7 @@ mod tests {
     #[test]
     fn a_feature_of_zero_is_the_mean_integral_of_the_images() {
         // A quarter of the pixels gains 0.4 in half the frames.
-        let scene = normalised(&dataset(2.0, 0.4), &[]).unwrap();
+        let scene = normalised(&dataset(2.0, 0.4), ABSOLUTE).unwrap();
         let mean = 2.0 + 0.4 / 8.0;
         let across = scene.static_gain * softplus(scene.static_shift) * (scene.static_max[0] - scene.static_min[0]);
         assert!((across - mean).abs() < 1e-6, "{across}");
@@ -275,19 +279,18 @@ mod tests {
 
     #[test]
     fn a_vessel_explains_the_largest_change_over_the_beat() {
-        let temporal = ["loss.dynamic_target=temporal", "loss.robust=0.3"];
         let data = dataset(2.0, 0.4);
-        let scene = normalised(&data, &temporal).unwrap();
+        let scene = normalised(&data, TEMPORAL).unwrap();
         let vessel = 0.05 * field_of_view(&data);
         assert!((scene.dynamic_gain * vessel - 0.4).abs() < 1e-5, "{}", scene.dynamic_gain * vessel);
         assert!((scene.dynamic_weight * 0.4 * 0.4 - 1.0).abs() < 1e-4);
         assert!((scene.robust_scale - 0.3 * 0.4).abs() < 1e-5);
         // Twice the change: twice the gain, and residuals weigh a quarter.
-        let strong = normalised(&dataset(2.0, 0.8), &temporal).unwrap();
+        let strong = normalised(&dataset(2.0, 0.8), TEMPORAL).unwrap();
         assert!((strong.dynamic_gain / scene.dynamic_gain - 2.0).abs() < 1e-4);
         assert!((strong.dynamic_weight / scene.dynamic_weight - 0.25).abs() < 1e-4);
         // Fields that share one residual share its weight, and there is nothing to be robust against.
-        let absolute = normalised(&data, &["loss.dynamic_target=absolute", "loss.robust=0.3"]).unwrap();
+        let absolute = normalised(&data, Loss { robust: 0.3, ..ABSOLUTE }).unwrap();
         assert_eq!((absolute.dynamic_weight, absolute.robust_scale), (absolute.static_weight, 0.0));
     }
 
@@ -329,11 +332,11 @@ mod tests {
     #[test]
     fn images_without_attenuation_are_refused() {
         for still in [0.0, -1.0] {
-            let error = normalised(&dataset(still, 0.0), &[]).unwrap_err().to_string();
+            let error = normalised(&dataset(still, 0.0), ABSOLUTE).unwrap_err().to_string();
             assert!(error.contains("images") && error.contains("must be positive"), "{error}");
         }
         // Nothing moves: the dynamic field is scaled to the images themselves.
-        let still = normalised(&dataset(2.0, 0.0), &[]).unwrap();
+        let still = normalised(&dataset(2.0, 0.0), ABSOLUTE).unwrap();
         assert!(still.dynamic_gain.is_finite() && still.dynamic_gain > 0.0);
     }
 }

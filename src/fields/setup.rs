@@ -129,8 +129,7 @@ fn shape_fields(setup: &mut Setup, params: &ParamMap) {
 }
 
 /// Sets the constants of the losses of two networks that have no schedule.
-fn set_networks(setup: &mut Setup, config: &Config) {
-    let networks = &config.networks;
+fn set_networks(setup: &mut Setup, networks: &Networks) {
     setup.two_networks = 1;
     setup.change_weight = networks.change_weight as f32;
     setup.min_change = networks.min_change as f32;

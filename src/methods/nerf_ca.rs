@@ -12,10 +12,11 @@ use crate::fields::data::{FieldData, RayLists, heart_shifts_ignored};
 use crate::fields::motion;
 use crate::fields::state;
 use crate::fitting::extent::between_phases;
-use crate::fitting::fit::{Abilities, Method, PlannedFit};
+use crate::fitting::fit::{Abilities, Method, PlannedFit, SavedAt, SavedFit};
 use crate::kernels::stages::StaticNetworkKernels;
 use crate::model::scene::Scene;
 use crate::scan::dataset::Dataset;
+use crate::tensors::File;
 
 /// The method, for the registry.
 pub static METHOD: Method = Method {

@@ -13,10 +13,11 @@ use crate::fields::motion::{self, Thresholds, ViewMotion};
 use crate::fields::scale::dynamic_half;
 use crate::fields::state;
 use crate::fitting::extent::between_phases;
-use crate::fitting::fit::{Abilities, Method, PlannedFit};
+use crate::fitting::fit::{Abilities, Method, PlannedFit, SavedAt, SavedFit};
 use crate::model::hull::Hull;
 use crate::model::scene::Scene;
 use crate::scan::dataset::Dataset;
+use crate::tensors::File;
 
 /// The method, for the registry.
 pub static METHOD: Method = Method {
@@ -38,8 +39,7 @@ fn plan(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<P
     let (config, settings) = (config.of::<NertCaSettings>()?, settings_of(config)?);
     let NertCaHull { min_share, min_share_few_views, dilate_pixels, .. } = config.hull;
     let motion = motion::analyse(dataset, Thresholds { min_share, min_share_few_views, dilate_pixels });
-    let hull =
-        choose_hull(&config.hull, dynamic_half(config.dynamic.half_extent_mm, dataset), dataset, &motion, notes);
+    let hull = choose_hull(&config.hull, dynamic_half(config.dynamic.half_extent_mm, dataset), dataset, &motion, notes);
     let scene = Scene::new(&settings, dataset, &motion, hull.as_ref())?;
     let lists = RayLists::of_hull(dataset, &motion, hull.as_ref());
     Ok(FieldData::new(&settings, dataset, &motion, hull, scene, lists)?.into())

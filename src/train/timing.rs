@@ -1,5 +1,6 @@
 //! Timing of training iterations.
 
+use crate::choice::Choice;
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::fitting::fit::{FitData, FitStart, Measured, Start};
@@ -291,8 +292,8 @@ pub struct GaussianSubject {
     notes: Vec<String>,
 }
 
-/// Timed iterations of fits of Gaussians alone, out of thousands that come before their Gaussians become more.
-const ALONE_TIMED: u32 = 200;
+/// Maximum number of timed iterations of a fit of Gaussians: some have thousands before their Gaussians become more.
+const MAX_TIMED: u32 = 200;
 
 /// Minimum number of fits: one says nothing of how they differ.
 const MIN_FITS: usize = 3;
@@ -389,7 +390,7 @@ impl GaussianSubject {
         let timing = GaussianTiming {
             form: work.form.unwrap_or_else(|| self.config.method_name()).into(),
             count: work.count,
-            grows: self.config.method().is_alone(),
+            grows: self.config.fields().is_none(),
             preparation_s: median(&preparation_s),
             ms,
             host_cpu_share,
@@ -406,7 +407,7 @@ impl GaussianSubject {
 }
 
 fn without_gaussians(config: &Config) -> Error {
-    Error::config("gaussians.form", config.gaussians.form.name(), "this configuration has no Gaussians to time")
+    Error::config("preset", config.preset.name(), "has no Gaussians to time")
 }
 
 /// Runs a fit up to an iteration.

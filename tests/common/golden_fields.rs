@@ -9,7 +9,7 @@ use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::model::scene::Scene;
 use nertca_vk::plan::Plan;
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
-use nertca_vk::selftest::problems::with_values;
+use nertca_vk_twins::selftest::problems::with_values;
 
 impl Golden {
     pub fn number(&self, key: &str) -> f64 {

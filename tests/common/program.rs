@@ -3,7 +3,7 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "shared by tests")]
 
 use nertca_vk::config::{Config, Preset};
-use nertca_vk::selftest::problems::with_values;
+use nertca_vk_twins::selftest::problems::with_values;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;

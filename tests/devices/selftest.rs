@@ -19,6 +19,7 @@ use nertca_vk_twins::inventory::{self, Compiled};
 use nertca_vk_twins::selftest::compare::Findings;
 use nertca_vk_twins::selftest::dynamic_gaussians as deformable;
 use nertca_vk_twins::selftest::iteration::F32_CASES;
+use nertca_vk_twins::selftest::problems::with_values;
 use nertca_vk_twins::selftest::r2_gaussian as r2;
 use nertca_vk_twins::selftest::sax_nerf as sax;
 use nertca_vk_twins::selftest::x_gaussian;
@@ -36,7 +37,7 @@ fn two_networks(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
 }
 
 fn many_gaussians(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
-    let config = r2::small_config(&[])?;
+    let config = r2::small_config(&[])?.into_any();
     blobs::compare_maxima(gpu, &config, &Tuning::for_device(gpu.info()), findings)
 }
 
@@ -138,7 +139,7 @@ fn the_inventory_is_what_a_run_builds() {
         };
         let form = form.map(|form| format!("gaussians.form={form}"));
         let settings: Vec<&str> = short.iter().copied().chain(form.as_deref()).collect();
-        let config = problems::with_values(&Config::preset(preset), settings.iter().copied()).unwrap();
+        let config = with_values(&Config::preset(preset), settings.iter().copied()).unwrap();
         let listed = open();
         let inventory = inventory::compile(&listed, &config, 3, &tuning(&listed)).unwrap();
         let names: BTreeSet<String> = inventory.iter().map(Compiled::name).collect();

@@ -391,7 +391,7 @@ fn an_earlier_field_is_shown_until_the_first_of_several_fits_is_done() {
     let gpu = gpu();
     let shot = of_two_views(&gpu);
     let (dataset, config) = (&shot.dataset, short());
-    let mut alone = config.fitted_once();
+    let mut alone = config.with(&["gaussians.fits=1".into()]).unwrap();
     alone.seed += 1;
     let mut first = Trainer::new(&gpu, Plan::new(&alone, dataset).unwrap(), dataset, tuning(&gpu)).unwrap();
     run(&mut first, config.gaussian_iterations());

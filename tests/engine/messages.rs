@@ -75,7 +75,7 @@ fn advice_against_divergence_names_only_settings_of_its_own_method() {
     let sections = sections();
     for preset in Preset::ALL.iter().copied() {
         let config = Config::preset(preset);
-        let advice = nertca_vk::methods::of(&config).smaller_steps();
+        let advice = nertca_vk::methods::of(&config).smaller_steps;
         let unknown: Vec<_> = keys_in(advice, &sections).into_iter().filter(|key| !config.acts(key)).collect();
         assert!(unknown.is_empty(), "{}: {advice}: {unknown:?}", preset.name());
     }

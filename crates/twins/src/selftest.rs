@@ -144,7 +144,7 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<TestPart<'a>> {
         (
             "views of many Gaussians".into(),
             Box::new(move |findings| {
-                blobs::compare_maxima(gpu, &r2_gaussian::small_config(&[])?, tuning, findings)
+                blobs::compare_maxima(gpu, &r2_gaussian::small_config(&[])?.into_any(), tuning, findings)
             }),
         ),
         ("volumes of Gaussians".into(), Box::new(move |findings| blobs::compare_cells(gpu, tuning, findings))),

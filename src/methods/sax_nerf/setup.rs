@@ -14,7 +14,7 @@ const RATE_FALL: f64 = 0.1;
 /// Decay of Adam's first and second moments, as in the public code.
 const BETAS: [f64; 2] = [0.9, 0.999];
 /// Constant added to the denominator of Adam's update, as in the public code.
-pub(super) const EPSILON: f64 = 1e-8;
+pub const EPSILON: f64 = 1e-8;
 
 /// Returns the constants of a field that do not depend on the target of drawing or fitting.
 fn field_setup(field: &SaxField) -> SaxSetup {

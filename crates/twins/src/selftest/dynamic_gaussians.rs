@@ -20,7 +20,7 @@ use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::{
     LOSS, NUMBERS, REPORT, SPLAT, TwinSplat, compare_backward, compare_gradient, compare_splats, device_gradient, f32s,
 };
-use crate::selftest::problems::{deformable_case, default_rules, fillings, hard_case, moving_set};
+use crate::selftest::problems::{default_rules, deformable_case, fillings, hard_case, moving_set};
 use crate::selftest::repeats::{ITERATIONS, bits_of, compare_runs, losses};
 use glam::DVec3;
 

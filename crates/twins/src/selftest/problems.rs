@@ -1,7 +1,7 @@
 //! Problems small enough for f64 twins: configurations and Gaussians that need no file.
 
 use crate::config::{Config, Preset};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::gaussians::field::{GaussianField, Gaussians, MovingGaussians, Units};
 use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry};
