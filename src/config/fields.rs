@@ -34,15 +34,15 @@ section! {
         layers: u32 in 1.0 to 16.0,
         /// Neurons per hidden layer, a multiple of 16.
         width: u32 in 16.0 to 1024.0,
-        /// Frequency bands of the encoding.
-        bands: u32 in 1.0 to 16.0,
-        /// Iterations until all bands are open, counted from the delay.
+        /// Iterations until all frequency bands of the encoding are open, counted from the delay.
         window_iterations: u32,
         /// Learning rate at the start.
         lr: f64 in 0.0 to 100.0,
         /// Learning rate at the end.
         lr_end: f64 in 0.0 to 100.0,
     } fixed {
+        /// Frequency bands of the encoding, as many as the publication or the preset has.
+        bands: u32 in 1.0 to 16.0,
         /// Hidden layer (from 1) that sees the encoded input again; 0 = none.
         skip_layer: u32,
         /// Length of a phase's latent vector, a multiple of 4.

@@ -215,7 +215,7 @@ impl MethodSettings for NertCaSettings {
         self.network.check_shape()?;
         let (start, bands) = (self.dynamic.window_start, self.network.bands);
         if start > f64::from(bands) {
-            return Err(Error::config("dynamic.window_start", start, format!("exceeds dynamic.bands = {bands}")));
+            return Err(Error::config("dynamic.window_start", start, format!("exceeds the {bands} frequency bands")));
         }
         self.fields(shared).iter().try_for_each(check_batches)
     }

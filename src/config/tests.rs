@@ -86,7 +86,7 @@ fn bad_settings_name_the_key() {
         (Preset::Fast, "static.lr=nan", "static.lr"),
         (Preset::Fast, "train", "setting"),
         (Preset::Paper, "dynamic.width=20", "dynamic.width"),
-        (Preset::Paper, "dynamic.window_start=11", "dynamic.bands"),
+        (Preset::Paper, "dynamic.window_start=11", "frequency bands"),
         (Preset::Paper, "march.static_samples=4096", ""),
         (Preset::R2Gaussian, "r2.n_points=0", "r2.n_points"),
         (Preset::R2Gaussian, "r2.tv_vol_size=300", "r2.tv_vol_size"),
