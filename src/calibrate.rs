@@ -2,9 +2,9 @@
 //! geometry).
 //!
 //! The change over the beat in one view must add up, in every plane through both sources, to the change in another view
-//! ([`profiles`]). Gauss-Newton on the difference ([`solve`]) finds two angles and a translation per view and, where the
-//! heart breathes, a displacement of the heart per frame. The component that no image determines is removed ([`gauge`]),
-//! and a correction is kept only if it predicts phases it was not fitted to ([`choose`]).
+//! ([`profiles`]). Gauss-Newton on the difference ([`solve`], with the unknowns and priors of [`estimate`]) finds two angles
+//! and a translation per view and, where the heart breathes, a displacement of the heart per frame. The component that no
+//! image determines is removed ([`gauge`]), and a correction is kept only if it predicts phases it was not fitted to ([`choose`]).
 
 pub mod adjustment;
 pub mod choose;

@@ -10,6 +10,7 @@ use rayon::prelude::*;
 const FLOOR: f64 = 0.02;
 /// Standard deviation of the Gaussian that a band subtracts, in standard deviations of the blur.
 const WIDE: f64 = 4.0;
+
 /// Parameters that a stage corrects, and its settings.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Stage {
