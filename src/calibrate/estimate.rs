@@ -302,7 +302,7 @@ mod tests {
                 let Unknown::Gain(_, phase) = unknown else { continue };
                 normal.add(&[i], |_, _| 1.0, |_| if *phase == 0 { -0.5 } else { -2.0 });
             }
-            let gains = normal.stepped(1e-3, &unknowns, &Poses::stated(2, 3)).unwrap().gains;
+            let gains = normal.stepped(1.0, &unknowns, &Poses::stated(2, 3)).unwrap().gains;
             let of_phase = gains[0][0] + gains[1][0];
             let all: f64 = gains.iter().flatten().sum();
             assert!(all.abs() < 1e-2, "{gains:?}");
