@@ -23,8 +23,8 @@ pub const DEPTH_MM: f64 = 1.0;
 pub const HEART_MM: [f64; 3] = [1.0, 0.6, 2.5];
 /// Standard deviation of the contrast of a frame, as a share: that of runs with moderate errors (`docs/degradations.md`).
 const CONTRAST: f64 = 0.2;
-/// Standard deviation of mean contrasts that images do not determine.
-const MEAN_CONTRAST: f64 = 1e-3;
+/// Standard deviation of mean contrasts that images do not determine: far smaller than any difference of contrasts that matters.
+const MEAN_CONTRAST: f64 = 2.5e-4;
 /// Minimum contrast of a frame: images are divided by it.
 const MIN_CONTRAST: f64 = 0.3;
 /// Maximum step of a translation, mm.
