@@ -108,10 +108,10 @@ fn columns_are_derivatives_of_the_twin() {
         let step = if unknown < 2 { 1e-3 } else { 1e-5 };
         let moved = |step: f64| {
             let mut moved = poses.clone();
-            for pose in &mut moved.views {
+            for (pose, stand) in moved.views.iter_mut().zip(&stands.stands) {
                 match unknown.checked_sub(2) {
                     None => pose.angles_deg[unknown] += step,
-                    Some(axis) => pose.shift[axis] += step,
+                    Some(axis) => pose.shift += step * stand.axes().col(axis),
                 }
             }
             images(&moved)

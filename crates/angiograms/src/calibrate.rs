@@ -2,13 +2,14 @@
 //! geometry).
 //!
 //! The change over the beat in one view must add up, in every plane through both sources, to the change in another view
-//! ([`profiles`]). Gauss-Newton on the difference ([`solve`]) finds two angles and a translation per view and, where the
-//! heart breathes, a displacement of the heart per frame. The component that no image determines is removed ([`gauge`]),
-//! and a correction is kept only if it predicts phases it was not fitted to ([`choose`]).
+//! ([`profiles`]). Gauss-Newton on the difference ([`solve`], with the unknowns and priors of [`estimate`]) finds two angles
+//! and a translation per view and, where the heart breathes, a displacement of the heart per frame. The component that no
+//! image determines is removed ([`gauge`]), and a correction is kept only if it predicts phases it was not fitted to ([`choose`]).
 
 pub mod adjustment;
 pub mod choose;
 pub mod correction;
+pub mod estimate;
 pub mod gauge;
 pub mod observed;
 pub mod pose;
@@ -27,12 +28,12 @@ use crate::scan::dataset::Dataset;
 use adjustment::Adjusted;
 use choose::{Correction, Validated, best, fit, misfit, validate};
 use correction::{Calibration, FrameCorrection, ViewCorrection};
-use gauge::{FrameRays, RigidMotion, common_motion};
+use estimate::{ACROSS_MM, ANGLE_DEG, DEPTH_MM, HEART_MM};
+use gauge::{FrameRays, RigidMotion, common_motion, frame_rays, heart_points};
 use glam::DVec3;
 use observed::Observed;
 use pose::Poses;
 use settings::{CalibrateMode, CalibrateSettings};
-use solve::{ANGLE_DEG, BREATHING_MM, DEPTH_MM, IN_PLANE_MM};
 
 /// Corrections beyond this many standard deviations of the expected errors are rejected.
 const BOUND: f64 = 4.0;
@@ -51,8 +52,6 @@ const WELL_EXPLAINED: f64 = 0.96;
 const LEFT_UNEXPLAINED: f64 = 0.75;
 /// Changes over the beat below this share of the images' range are rounding errors.
 pub(crate) const MIN_CHANGE: f64 = 1e-5;
-/// Half side of the cube that represents the heart when corrections are compared, as a share of half the field of view.
-const HEART_SHARE: f64 = 0.5;
 
 /// Calibrates the training views of a dataset as the settings ask.
 ///
@@ -225,7 +224,7 @@ impl Calibrator<'_> {
         ));
         let all: Vec<usize> = (0..self.observed.n_phases()).collect();
         let share = |poses: &Poses| misfit(&self.observed.fine, poses, &all).share();
-        let stated = share(&Poses::stated(self.observed.views.len(), all.len()));
+        let stated = share(&self.stated());
         let tried = candidates[1.min(candidates.len() - 1)];
         let poses = fit(self.observed, tried, &all);
         let shares = vec![(Correction::Stated, stated), (tried, share(&poses))];
@@ -250,8 +249,7 @@ impl Calibrator<'_> {
             ));
             return Calibration { tried, notes: self.notes, ..Calibration::none(None) };
         }
-        let stated = Poses::stated(self.observed.views.len(), self.observed.n_phases());
-        let explained = [&stated, poses].map(|poses| silhouettes::explained(self.observed, poses));
+        let explained = self.explained(poses);
         if !self.observed.cut_off().is_empty() && !helps_clearly(correction, &tried, explained) {
             self.notes.push(format!(
                 "the stated geometry is kept: a correction reduces the residual of the moving vessels ({}), but the \
@@ -273,8 +271,7 @@ impl Calibrator<'_> {
         repeatability_px: Option<f64>,
         tried: Vec<(Correction, f64)>,
     ) -> Calibration {
-        let stated = Poses::stated(self.observed.views.len(), self.observed.n_phases());
-        let explained = [&stated, poses].map(|poses| silhouettes::explained(self.observed, poses));
+        let stated = self.stated();
         let moved = self.motion(&stated, poses);
         let disagreement_px = self.distance_px(&stated, poses);
         let view = |slot: usize| self.view(slot, poses, &moved);
@@ -287,7 +284,7 @@ impl Calibrator<'_> {
             disagreement_px,
             repeatability_px,
             tried,
-            explained,
+            explained: self.explained(poses),
             explained_by_chance: Some(silhouettes::explained_by_chance(self.observed, poses)),
             adjustment: None,
             notes: self.notes,
@@ -306,8 +303,8 @@ impl Calibrator<'_> {
             let all: Vec<usize> = (0..views.n_phases).collect();
             choose::misfit(&views, poses, &all).share()
         };
-        let before = Poses::stated(poses.views.len(), self.observed.n_phases());
-        let frames: Vec<FrameRays> = self.frame_rays(&before, poses, Some(slot));
+        let before = self.stated();
+        let frames = frame_rays(&self.observed.stands, slot..slot + 1, [&before, poses]);
         ViewCorrection {
             view,
             primary_deg: pose.angles_deg[0],
@@ -335,38 +332,36 @@ impl Calibrator<'_> {
         (0..self.observed.views.len()).flat_map(of_view).collect()
     }
 
-    /// Points that represent the heart: the corners and the centre of a cube.
+    /// Points that represent the heart.
     fn points(&self) -> Vec<DVec3> {
-        let rays = &self.observed.stands[0].rays;
-        let [width, height] = self.observed.sizes[0].map(|n| n as f64);
-        let half = HEART_SHARE * 0.5 * rays.anchor[1].length().min(rays.anchor[2].length()) * width.min(height);
-        let sign = |k: usize, axis: usize| if k >> axis & 1 == 1 { half } else { -half };
-        let corners = (0..8).map(|k| DVec3::new(sign(k, 0), sign(k, 1), sign(k, 2)));
-        corners.chain([DVec3::ZERO]).collect()
+        heart_points(&self.observed.stands[0].rays, self.observed.sizes[0])
     }
 
-    /// Rays of the frames at two sets of poses, in binned pixels; of one view, or of all.
-    fn frame_rays(&self, a: &Poses, b: &Poses, of: Option<usize>) -> Vec<FrameRays> {
-        let mut frames = Vec::new();
-        for (slot, stand) in self.observed.stands.iter().enumerate().filter(|(slot, _)| of.is_none_or(|o| o == *slot)) {
-            for t in 0..self.observed.n_phases() {
-                let rays = |p: &Poses| stand.corrected_rays(&p.views[slot], p.heart[slot][t]);
-                frames.push(FrameRays { phase: t, truth: rays(a), corrected: rays(b) });
-            }
-        }
-        frames
+    /// Rays of all frames at two sets of poses, in binned pixels.
+    fn frame_rays(&self, poses: [&Poses; 2]) -> Vec<FrameRays> {
+        frame_rays(&self.observed.stands, 0..self.observed.stands.len(), poses)
+    }
+
+    /// Shares of the vessel pixels that the other views explain, as stated and at poses.
+    fn explained(&self, poses: &Poses) -> [f64; 2] {
+        [&self.stated(), poses].map(|poses| silhouettes::explained(self.observed, poses))
+    }
+
+    /// Poses without corrections.
+    fn stated(&self) -> Poses {
+        Poses::stated(self.observed.views.len(), self.observed.n_phases())
     }
 
     /// Motion common to all views from one set of poses to another.
     fn motion(&self, a: &Poses, b: &Poses) -> RigidMotion {
         let breathes = [a, b].iter().any(|p| p.heart.iter().flatten().any(|s| *s != DVec3::ZERO));
-        common_motion(&self.frame_rays(a, b, None), &self.points(), self.observed.n_phases(), breathes)
+        common_motion(&self.frame_rays([a, b]), &self.points(), self.observed.n_phases(), breathes)
     }
 
     /// Root mean square distance between the images of the heart at two sets of poses, without the motion common to all
     /// views, in the dataset's pixels.
     fn distance_px(&self, a: &Poses, b: &Poses) -> f64 {
-        let frames = self.frame_rays(a, b, None);
+        let frames = self.frame_rays([a, b]);
         self.motion(a, b).remainder_px(&frames, &self.points()) * self.observed.factor as f64
     }
 }
@@ -391,11 +386,11 @@ fn out_of_bounds(observed: &Observed, poses: &Poses) -> Option<String> {
             return Some(format!("view {view} turns by {angle:.1} deg"));
         }
         let (across, depth) = (along(0).max(along(1)), along(2));
-        if across.is_nan() || across > BOUND * IN_PLANE_MM || depth.is_nan() || depth > BOUND * DEPTH_MM {
+        if across.is_nan() || across > BOUND * ACROSS_MM || depth.is_nan() || depth > BOUND * DEPTH_MM {
             return Some(format!("view {view} moves by {:.1} mm", across.max(depth)));
         }
         for (phase, shift) in poses.heart[slot].iter().enumerate() {
-            let far = |k: usize| (shift[k] * MM_PER_UNIT).abs() > BOUND * BREATHING_MM[k];
+            let far = |k: usize| (shift[k] * MM_PER_UNIT).abs() > BOUND * HEART_MM[k];
             if (0..3).any(far) || !shift.is_finite() {
                 return Some(format!(
                     "the heart moves by {:.1} mm in view {view}, phase {phase}",

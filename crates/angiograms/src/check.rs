@@ -16,6 +16,7 @@ use crate::calibrate::pose::Poses;
 use crate::calibrate::profiles::Views;
 use crate::calibrate::silhouettes;
 use crate::error::{Error, Result};
+use crate::evidence::noise::NOISY;
 use crate::scan::dataset::Dataset;
 use agreement::{Agreement, Comparison, Sharpness, agreement};
 use evidence::Judged;
@@ -32,9 +33,6 @@ const AS_GOOD: f64 = 1.25;
 const DISAGREES: f64 = 0.3;
 /// Share of a view's changes next to its edges above which vessels are likely to be cut off.
 const CUT_OFF: f64 = 0.05;
-/// Noise, as a share of the strongest change, above which thin vessels are lost.
-const NOISY: f64 = 0.2;
-
 /// Angle between two views, degrees, below which their common depth is hardly determined.
 const NARROW_DEG: f64 = 30.0;
 
@@ -239,7 +237,7 @@ fn view_warnings(views: &[CheckedView]) -> Vec<String> {
                 v.view
             ));
         }
-        if let Some(noise) = v.noise.filter(|noise| *noise > NOISY) {
+        if let Some(noise) = v.noise.filter(|noise| *noise >= f64::from(NOISY)) {
             let share = 100.0 * noise;
             warnings.push(format!(
                 "view {}: the noise is {share:.0} % of the strongest vessel, so thin vessels will be lost",

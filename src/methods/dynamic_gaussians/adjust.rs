@@ -179,7 +179,7 @@ impl Adjuster<'_> {
                 let Some(Fitted { trainer, .. }) = fit else { return Ok(None) };
                 earlier = Some(trainer.deformable()?).filter(|field| !field.rest.rows.is_empty());
                 let next = FieldInLoop::new(&trainer, &self.stands).stepped(&poses, STEPS)?;
-                let change_px = self.stands.change_px(trainer.targets(), &poses, &next);
+                let change_px = self.stands.change_px(&poses, &next);
                 tracing::debug!("cycle {number} of the adjustment: {} Gaussians, {change_px:.3} px", trainer.count());
                 poses = extrapolated(&poses, &next, if number < N_CYCLES { FARTHER } else { 1.0 });
                 if change_px < SETTLED_PX {

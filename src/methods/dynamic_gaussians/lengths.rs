@@ -9,8 +9,8 @@ use std::borrow::Borrow;
 /// Smaller side, pixels, of the images to which the settings' lengths refer.
 const SIDE: f64 = 100.0;
 /// Noise, as a share of the strongest change, from which on vessels are smoothed most.
-const NOISY: f64 = 0.1;
-/// Factor on the minimum scale at that noise.
+const SMOOTHEST_AT: f64 = 0.1;
+/// Factor on the minimum scale from that noise on; with less noise it grows in proportion.
 const SMOOTHEST: f64 = 1.5;
 /// Upper limit of a minimum scale that noise has raised, as a share of the width of wide vessels.
 const SHARE_OF_WIDTH: f64 = 0.27;
@@ -33,7 +33,7 @@ impl Lengths {
     /// `noise` of their pixels, as a share of the strongest change; `min_scale` is the setting.
     pub fn new(side: usize, width: f64, noise: f32, min_scale: f64) -> Lengths {
         let factor = side as f64 / SIDE;
-        let share = f64::from(noise) / NOISY;
+        let share = f64::from(noise) / SMOOTHEST_AT;
         let wanted = 1.0 + (SMOOTHEST - 1.0) * share.clamp(0.0, 1.0);
         let possible = SHARE_OF_WIDTH * width / (factor * min_scale);
         Lengths { factor, smoothing: wanted.min(possible).max(1.0) }

@@ -1,13 +1,11 @@
 //! Freedom of the motion of a deformable set, by the noise of the images and the number of views.
 
+use crate::evidence::noise::NOISY;
 use crate::methods::dynamic_gaussians::rules::DeformableRules;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
 /// Number of views up to which the motion is stiff in noise: with few views, free motion explains noise.
 const FEW_VIEWS: usize = 3;
-/// Noise of the median pixel, as a share of the strongest change, from which on images are noisy: 1e5 photons give 0.10, 2e4
-/// photons 0.22.
-const NOISY: f32 = 0.15;
 /// Number of views up to which the motion is stiff without noise as well: with free motion, false crossings of two views' rays explain the
 /// images of all phases.
 const TWO_VIEWS: usize = 2;

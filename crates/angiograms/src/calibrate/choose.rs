@@ -1,6 +1,7 @@
 //! Decides whether a correction helps, and which one: each is fitted to some phases and tested on the others (method,
 //! robustness of geometry, section 12).
 
+use crate::calibrate::estimate::{Freedom, TEMPER};
 use crate::calibrate::gauge;
 use crate::calibrate::observed::Observed;
 use crate::calibrate::pose::Poses;
@@ -15,8 +16,6 @@ const COARSE: [f64; 2] = [24.0, 12.0];
 const FINE: [f64; 2] = [6.0, 3.0];
 /// Gauss-Newton steps of each coarse and each fine stage.
 const STEPS: [usize; 2] = [2, 3];
-/// Residuals of the fine stages are correlated far beyond the blur: this many count as one.
-const TEMPER: f64 = 10.0;
 /// A correction must remove at least this share of the squared residual at phases it was not fitted to; chance removes
 /// less.
 pub const MIN_GAIN: f64 = 0.02;
@@ -52,12 +51,10 @@ pub fn fit(observed: &Observed, correction: Correction, phases: &[usize]) -> Pos
     let stage = |blur, steps, fine: bool| Stage {
         blur,
         steps,
-        breathing,
         band: fine,
-        angles: fine,
+        freedom: Freedom { across: true, angles_and_depth: fine, heart: breathing, mean_contrasts: false },
         demean: fine,
         temper: if fine { TEMPER } else { 1.0 },
-        contrast_alone: false,
     };
     COARSE.iter().for_each(|b| solve::refine(&observed.coarse, &mut poses, &stage(*b, STEPS[0], false), phases));
     gauge::fix(&observed.stands, &mut poses, breathing);

@@ -5,6 +5,10 @@ use crate::calibrate::pose::{Poses, StatedView};
 use crate::geometry::{ViewRays, lps_mm_from_world, world_from_lps_mm};
 use crate::linear::Symmetric;
 use glam::{DAffine3, DMat3, DVec3};
+use std::ops::Range;
+
+/// Half side of the cube that represents the heart when poses are compared, as a share of half the field of view.
+const HEART_SHARE: f64 = 0.5;
 
 /// Projections of a shift onto the plane across each view's axis, and the inverse of their sum over the views.
 struct Across {
@@ -48,6 +52,25 @@ pub fn fix(stands: &[StatedView], poses: &mut Poses, breathing: bool) {
     }
     let common = across.common(poses.views.iter().map(|p| p.shift));
     poses.views.iter_mut().for_each(|p| p.shift -= common);
+}
+
+/// Returns points that represent the heart: the corners and the centre of a cube around the isocentre, for a view with these rays and
+/// columns and rows.
+pub fn heart_points(rays: &ViewRays, [width, height]: [usize; 2]) -> Vec<DVec3> {
+    let pixel = rays.anchor[1].length().min(rays.anchor[2].length());
+    let half = HEART_SHARE * 0.5 * pixel * width.min(height) as f64;
+    let sign = |k: usize, axis: usize| if k >> axis & 1 == 1 { half } else { -half };
+    let corners = (0..8).map(|k| DVec3::new(sign(k, 0), sign(k, 1), sign(k, 2)));
+    corners.chain([DVec3::ZERO]).collect()
+}
+
+/// Returns the rays of all frames of the views `of` at two sets of poses.
+pub fn frame_rays(stands: &[StatedView], of: Range<usize>, [a, b]: [&Poses; 2]) -> Vec<FrameRays> {
+    let of_view = |slot: usize| {
+        let rays = move |p: &Poses, t: usize| stands[slot].corrected_rays(&p.views[slot], p.heart[slot][t]);
+        (0..a.heart[slot].len()).map(move |t| FrameRays { phase: t, truth: rays(a, t), corrected: rays(b, t) })
+    };
+    of.flat_map(of_view).collect()
 }
 
 /// Rays of a training frame by its true and by its corrected geometry.

@@ -1,32 +1,15 @@
 //! Most likely corrections, by Gauss-Newton on the difference of profiles (method, robustness of geometry, section 5).
 
+use crate::calibrate::estimate::{Freedom, Normal, Unknown, Unknowns};
 use crate::calibrate::pose::Poses;
-use crate::calibrate::profiles::{Blur, Pair, PairAtPhase, Pencil, Views};
-use crate::geometry::MM_PER_UNIT;
-use crate::linear::Symmetric;
+use crate::calibrate::profiles::{Blur, Moving, Pair, PairAtPhase, Pencil, Views};
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// Expected standard deviation of errors of the angles, degrees.
-pub const ANGLE_DEG: f64 = 0.3;
-/// Expected standard deviation of errors of the patient's position across the view, mm.
-pub const IN_PLANE_MM: f64 = 3.0;
-/// Expected standard deviation of errors of the patient's position along the view, mm.
-pub const DEPTH_MM: f64 = 1.0;
-/// Expected standard deviation of the heart's displacement by breathing along (posterior, left, superior), mm.
-pub const BREATHING_MM: [f64; 3] = [1.5, 1.5, 4.0];
-/// Expected standard deviation of the contrast of a frame.
-const GAIN: f64 = 0.1;
-/// Standard deviation of the mean contrast of a phase's frames. Images do not determine this mean: without a prior all
-/// gains tend to -1, where every residual vanishes.
-const MEAN_GAIN: f64 = 1e-3;
 /// Residual that is always expected, as a share of the profiles.
 const FLOOR: f64 = 0.02;
 /// Standard deviation of the Gaussian that a band subtracts, in standard deviations of the blur.
 const WIDE: f64 = 4.0;
-/// Maximum step of a translation, and of an angle.
-const LONGEST_STEP_MM: f64 = 4.0;
-const LONGEST_STEP_DEG: f64 = 2.0;
 
 /// Parameters that a stage corrects, and its settings.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -38,30 +21,13 @@ pub struct Stage {
     pub band: bool,
     /// Gauss-Newton steps.
     pub steps: usize,
-    /// Angles and depth are corrected, in addition to positions across the view.
-    pub angles: bool,
-    /// Each frame has a displacement of its own.
-    pub breathing: bool,
+    /// Corrections that are sought.
+    pub freedom: Freedom,
     /// The part that is constant over the beat is removed: it is an error of the static background.
     pub demean: bool,
     /// Factor on the variance of the residuals: they are errors of the model, correlated between neighbours, more than
     /// noise.
     pub temper: f64,
-    /// Views and frames stay fixed: only contrasts are fitted.
-    pub contrast_alone: bool,
-}
-
-/// One unknown parameter.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Unknown {
-    /// View, and its primary (0) or secondary (1) angle, degrees.
-    Angle(usize, usize),
-    /// View, and its position along an axis of the C-arm, world units.
-    Shift(usize, usize),
-    /// View and phase, and the displacement along an axis of the world, world units.
-    Heart(usize, usize, usize),
-    /// View and phase whose relative contrast is sought.
-    Gain(usize, usize),
 }
 
 impl Stage {
@@ -70,77 +36,11 @@ impl Stage {
     }
 }
 
-impl Unknown {
-    fn deviation(self) -> f64 {
-        match self {
-            Unknown::Angle(..) => ANGLE_DEG,
-            Unknown::Shift(_, 2) => DEPTH_MM / MM_PER_UNIT,
-            Unknown::Shift(..) => IN_PLANE_MM / MM_PER_UNIT,
-            Unknown::Heart(_, _, axis) => BREATHING_MM[axis] / MM_PER_UNIT,
-            Unknown::Gain(..) => GAIN,
-        }
-    }
-
-    fn value(self, views: &Views, poses: &Poses) -> f64 {
-        match self {
-            Unknown::Angle(v, k) => poses.views[v].angles_deg[k],
-            Unknown::Shift(v, k) => poses.views[v].shift.dot(views.views[v].stand.axes().col(k)),
-            Unknown::Heart(v, t, k) => poses.heart[v][t][k],
-            Unknown::Gain(v, t) => poses.gains[v][t],
-        }
-    }
-
-    fn add(self, step: f64, views: &Views, poses: &mut Poses) {
-        match self {
-            Unknown::Angle(v, k) => poses.views[v].angles_deg[k] += step,
-            Unknown::Shift(v, k) => poses.views[v].shift += step * views.views[v].stand.axes().col(k),
-            Unknown::Heart(v, t, k) => poses.heart[v][t][k] += step,
-            Unknown::Gain(v, t) => poses.gains[v][t] += step,
-        }
-    }
-}
-
-/// All unknowns of a stage: those of a view, then those of each of its frames, view by view.
-struct Unknowns {
-    all: Vec<Unknown>,
-    /// Unknowns of each view.
-    of_view: Vec<Vec<usize>>,
-    /// Unknowns of each frame, `[view][phase]`.
-    of_frame: Vec<Vec<Vec<usize>>>,
-}
-
-impl Unknowns {
-    fn of(views: &Views, stage: &Stage, phases: &[usize]) -> Unknowns {
-        let mut unknowns = Unknowns { all: Vec::new(), of_view: Vec::new(), of_frame: Vec::new() };
-        for (v, view) in views.views.iter().enumerate() {
-            let mut of_view = Vec::new();
-            if !stage.contrast_alone {
-                of_view.extend([Unknown::Shift(v, 0), Unknown::Shift(v, 1)]);
-                if stage.angles {
-                    of_view.extend([Unknown::Angle(v, 0), Unknown::Angle(v, 1), Unknown::Shift(v, 2)]);
-                }
-            }
-            let of_view = unknowns.add(of_view);
-            unknowns.of_view.push(of_view);
-            let mut of_frame = vec![Vec::new(); views.n_phases];
-            for t in phases.iter().copied().filter(|t| view.phases[*t].is_some()) {
-                let mut of_this = vec![Unknown::Gain(v, t)];
-                if stage.breathing && !stage.contrast_alone {
-                    of_this.extend((0..3).map(|k| Unknown::Heart(v, t, k)));
-                }
-                of_frame[t] = unknowns.add(of_this);
-            }
-            unknowns.of_frame.push(of_frame);
-        }
-        unknowns
-    }
-
-    /// Appends unknowns and returns their indices.
-    fn add(&mut self, more: Vec<Unknown>) -> Vec<usize> {
-        let first = self.all.len();
-        self.all.extend(more);
-        (first..self.all.len()).collect()
-    }
+/// Collects the unknowns of a stage at the wanted phases.
+fn unknowns(views: &Views, stage: &Stage, phases: &[usize]) -> Unknowns {
+    let axes = views.views.iter().map(|view| view.stand.axes()).collect();
+    let shown = |view: &Moving| phases.iter().copied().filter(|t| view.phases[*t].is_some()).collect();
+    Unknowns::new(axes, stage.freedom, &views.views.iter().map(shown).collect::<Vec<_>>())
 }
 
 /// Derivative of a pair's pencil by one unknown: velocity of the baseline's end relative to its beginning, and the
@@ -182,8 +82,7 @@ impl Residuals {
         let gains = pair.views.map(|v| poses.gains[v][at.phase]);
         let mut columns = Vec::new();
         for (side, v) in pair.views.into_iter().enumerate() {
-            let indices = unknowns.of_view[v].iter().chain(&unknowns.of_frame[v][at.phase]);
-            for index in indices.copied() {
+            for index in unknowns.of_frame(v, at.phase) {
                 let unknown = unknowns.all[index];
                 let column = match motion_of(unknown, side, v, views, poses) {
                     None => {
@@ -240,11 +139,8 @@ fn slope(
 
 /// Contribution of all phases of a pair to the normal equations.
 struct PairTerms {
-    matrix: Symmetric,
-    gradient: Vec<f64>,
-    squares: f64,
-    power: f64,
-    count: usize,
+    normal: Normal,
+    misfit: Misfit,
 }
 
 fn dot(a: &[f64], b: &[f64]) -> f64 {
@@ -257,17 +153,11 @@ impl PairTerms {
         let profiles = views.profiles(pair, poses, phases, &blur);
         let residuals: Vec<Residuals> =
             profiles.iter().map(|at| Residuals::of(at, pair, views, poses, unknowns)).collect();
-        let mut terms = PairTerms {
-            matrix: Symmetric::zeros(unknowns.all.len()),
-            gradient: vec![0.0; unknowns.all.len()],
-            squares: 0.0,
-            power: 0.0,
-            count: 0,
-        };
+        let mut terms = PairTerms::none(unknowns);
         for r in &residuals {
             terms.add(&r.value, &r.columns, 1.0);
-            terms.power += r.power;
-            terms.count += r.value.iter().filter(|v| **v != 0.0).count();
+            terms.misfit.power += r.power;
+            terms.misfit.count += r.value.iter().filter(|v| **v != 0.0).count();
         }
         if stage.demean && !residuals.is_empty() {
             // The sum of squared deviations from the mean is that of the values minus that of the mean.
@@ -287,21 +177,30 @@ impl PairTerms {
         terms
     }
 
-    fn add(&mut self, value: &[f64], columns: &[(usize, Vec<f64>)], scale: f64) {
-        self.squares += scale * dot(value, value);
-        for (k, (i, a)) in columns.iter().enumerate() {
-            self.gradient[*i] += scale * dot(a, value);
-            for (j, b) in &columns[..=k] {
-                self.matrix.add(*i, *j, scale * dot(a, b));
-            }
-        }
+    fn none(unknowns: &Unknowns) -> PairTerms {
+        let misfit = Misfit { squares: 0.0, power: 0.0, count: 0 };
+        PairTerms { normal: Normal::zeros(unknowns.all.len()), misfit }
     }
-}
 
-/// Sum of all pairs' terms, divided by the expected variance of the residuals, and the priors.
-struct Normal {
-    matrix: Symmetric,
-    gradient: Vec<f64>,
+    fn add(&mut self, value: &[f64], columns: &[(usize, Vec<f64>)], scale: f64) {
+        self.misfit.squares += scale * dot(value, value);
+        let indices: Vec<usize> = columns.iter().map(|(index, _)| *index).collect();
+        let product = |k: usize, l: usize| scale * dot(&columns[k].1, &columns[l].1);
+        self.normal.add(&indices, product, |k| scale * dot(&columns[k].1, value));
+    }
+
+    /// Returns the sum over all pairs.
+    fn sum(views: &Views, poses: &Poses, stage: &Stage, phases: &[usize], unknowns: &Unknowns) -> PairTerms {
+        let term = |pair: &Pair| PairTerms::of(views, *pair, poses, stage, phases, unknowns);
+        let terms: Vec<PairTerms> = views.pairs.par_iter().map(term).collect();
+        terms.iter().fold(PairTerms::none(unknowns), |mut sum, PairTerms { normal, misfit }| {
+            sum.normal.add_all(normal);
+            sum.misfit.squares += misfit.squares;
+            sum.misfit.power += misfit.power;
+            sum.misfit.count += misfit.count;
+            sum
+        })
+    }
 }
 
 /// Sums of squares over all pairs, phases and bins.
@@ -319,90 +218,36 @@ impl Misfit {
     pub fn share(&self) -> f64 {
         (self.squares / self.power.max(f64::MIN_POSITIVE)).sqrt()
     }
-}
 
-impl Normal {
-    fn of(views: &Views, poses: &Poses, stage: &Stage, phases: &[usize], unknowns: &Unknowns) -> (Normal, Misfit) {
-        let term = |pair: &Pair| PairTerms::of(views, *pair, poses, stage, phases, unknowns);
-        let terms: Vec<PairTerms> = views.pairs.par_iter().map(term).collect();
-        let n = unknowns.all.len();
-        let mut normal = Normal { matrix: Symmetric::zeros(n), gradient: vec![0.0; n] };
-        let mut misfit = Misfit { squares: 0.0, power: 0.0, count: 0 };
-        for t in &terms {
-            normal.matrix.add_all(&t.matrix);
-            normal.gradient.iter_mut().zip(&t.gradient).for_each(|(g, t)| *g += t);
-            misfit.squares += t.squares;
-            misfit.power += t.power;
-            misfit.count += t.count;
-        }
-        let count = misfit.count.max(1) as f64;
-        let expected = misfit.squares / count + FLOOR * FLOOR * misfit.power / count;
+    /// Expected variance of the residuals of a stage.
+    fn variance(&self, stage: &Stage) -> f64 {
+        let count = self.count.max(1) as f64;
+        let expected = self.squares / count + FLOOR * FLOOR * self.power / count;
         // Blurred residuals are correlated between neighbours.
         let alike = 2.0 * std::f64::consts::PI.sqrt() * stage.blur;
-        let variance = expected * alike * stage.temper;
-        normal.matrix.scale(1.0 / variance);
-        normal.gradient.iter_mut().for_each(|g| *g /= variance);
-        normal.add_priors(views, poses, unknowns);
-        (normal, misfit)
-    }
-
-    fn add_priors(&mut self, views: &Views, poses: &Poses, unknowns: &Unknowns) {
-        for (i, unknown) in unknowns.all.iter().enumerate() {
-            self.matrix.add(i, i, 1.0);
-            self.gradient[i] += unknown.value(views, poses) / unknown.deviation();
-        }
-        for phase in 0..views.n_phases {
-            let here = |u: &Unknown| matches!(u, Unknown::Gain(_, t) if *t == phase);
-            let gains: Vec<usize> = (0..unknowns.all.len()).filter(|i| here(&unknowns.all[*i])).collect();
-            let weight = (GAIN / MEAN_GAIN).powi(2);
-            let sum: f64 = gains.iter().map(|i| unknowns.all[*i].value(views, poses) / GAIN).sum();
-            for (k, i) in gains.iter().enumerate() {
-                self.gradient[*i] += weight * sum;
-                gains[..=k].iter().for_each(|j| self.matrix.add(*i, *j, weight));
-            }
-        }
+        expected * alike * stage.temper
     }
 }
 
 /// Runs a stage's steps on the wanted phases. Poses do not change where there is no information.
 pub fn refine(views: &Views, poses: &mut Poses, stage: &Stage, phases: &[usize]) {
-    let unknowns = Unknowns::of(views, stage, phases);
+    let unknowns = unknowns(views, stage, phases);
     for _ in 0..stage.steps {
-        let (normal, misfit) = Normal::of(views, poses, stage, phases, &unknowns);
+        let PairTerms { normal, misfit } = PairTerms::sum(views, poses, stage, phases, &unknowns);
         if misfit.power == 0.0 {
             return;
         }
-        let Some(mut step) = normal.matrix.solve(&normal.gradient) else { return };
-        let longest = LONGEST_STEP_MM / MM_PER_UNIT;
-        for (unknown, step) in unknowns.all.iter().zip(&mut step) {
-            *step *= -unknown.deviation();
-        }
-        let too_long = |(u, step): (&Unknown, &f64)| match u {
-            Unknown::Shift(..) | Unknown::Heart(..) => step.abs() / longest,
-            Unknown::Angle(..) => step.abs() / LONGEST_STEP_DEG,
-            Unknown::Gain(..) => 0.0,
-        };
-        let scale = 1.0 / unknowns.all.iter().zip(&step).map(too_long).fold(1.0, f64::max);
-        unknowns.all.iter().zip(step).for_each(|(u, s)| u.add(scale * s, views, poses));
+        let Some(next) = normal.stepped(misfit.variance(stage), &unknowns, poses) else { return };
+        *poses = next;
     }
 }
 
 /// Misfit of the views at the wanted phases, with the contrasts of the frames fitted.
 pub fn misfit(views: &Views, poses: &Poses, blur: f64, phases: &[usize]) -> Misfit {
-    let stage = Stage {
-        blur,
-        band: true,
-        steps: 2,
-        angles: false,
-        breathing: false,
-        demean: true,
-        temper: 1.0,
-        contrast_alone: true,
-    };
+    let stage = Stage { blur, band: true, steps: 2, freedom: Freedom::CONTRASTS, demean: true, temper: 1.0 };
     let mut fitted = Poses { gains: Poses::stated(views.views.len(), views.n_phases).gains, ..poses.clone() };
     refine(views, &mut fitted, &stage, phases);
-    let unknowns = Unknowns::of(views, &stage, &[]);
-    Normal::of(views, &fitted, &stage, phases, &unknowns).1
+    PairTerms::sum(views, &fitted, &stage, phases, &unknowns(views, &stage, &[])).misfit
 }
 
 #[cfg(test)]
@@ -416,11 +261,9 @@ mod tests {
             blur: 4.0,
             band: true,
             steps: 1,
-            angles: true,
-            breathing: true,
+            freedom: Freedom { mean_contrasts: false, ..Freedom::ALL },
             demean: false,
             temper: 1.0,
-            contrast_alone: false,
         }
     }
 
@@ -456,7 +299,7 @@ mod tests {
     #[test]
     fn slopes_are_those_of_the_residuals() {
         let views = views(&ANGLES);
-        let unknowns = Unknowns::of(&views, &stage(), &[0, 1, 2]);
+        let unknowns = unknowns(&views, &stage(), &[0, 1, 2]);
         let poses = off(3);
         for pair in views.pairs.iter().copied() {
             let here = residuals(&views, pair, &poses, &unknowns);
@@ -466,7 +309,7 @@ mod tests {
                     let step = 1e-3 * unknown.deviation();
                     let moved = |sign: f64| {
                         let mut moved = poses.clone();
-                        unknown.add(sign * step, &views, &mut moved);
+                        unknown.add(sign * step, &unknowns.axes, &mut moved);
                         residuals(&views, pair, &moved, &unknowns).swap_remove(t).value
                     };
                     let want: Vec<f64> = moved(1.0).iter().zip(moved(-1.0)).map(|(a, b)| (a - b) / 2e-3).collect();
@@ -489,7 +332,7 @@ mod tests {
         crate::calibrate::gauge::fix(&stands, &mut fixed, true);
         let moved = (poses.views[0].shift - fixed.views[0].shift).length();
         assert!(moved > 1e-3 && (fixed.views[0].angles_deg[0] - poses.views[0].angles_deg[0]).abs() > 0.05, "{moved}");
-        let unknowns = Unknowns::of(&views, &stage(), &[]);
+        let unknowns = unknowns(&views, &stage(), &[]);
         for pair in views.pairs.iter().copied() {
             let (before, after) =
                 (residuals(&views, pair, &poses, &unknowns), residuals(&views, pair, &fixed, &unknowns));

@@ -2,6 +2,10 @@
 
 use crate::raster::median;
 
+/// Noise of the median pixel, as a share of the strongest change, from which on images are noisy: a fit explains much of the noise, and thin
+/// vessels are lost. 1e5 photons give 0.10, 2e4 photons 0.22.
+pub const NOISY: f32 = 0.15;
+
 /// Mean distance of the minimum of `n` standard normal draws below their expected value.
 pub fn expected_minimum(n: usize) -> f64 {
     // Blom's approximation of the first normal order statistic.

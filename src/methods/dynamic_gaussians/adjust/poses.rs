@@ -1,15 +1,13 @@
 //! Poses of the views as unknowns: stated views, and what the frames see at given poses.
 
 use crate::calibrate::correction::Calibration;
+use crate::calibrate::gauge::{RigidMotion, frame_rays, heart_points};
 use crate::calibrate::pose::{Poses, StatedView, ViewPose};
 use crate::gaussians::view::SplatView;
 use crate::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::scan::dataset::{Dataset, Frame};
 use glam::DVec3;
-
-/// Distance of points of the heart from the isocentre, as a share of half the field of view.
-const HEART_SHARE: f64 = 0.5;
 
 /// Views of a dataset with their stated geometry. A slot is an index into the views that the Gaussians are fitted to.
 pub struct Stands<'a> {
@@ -66,17 +64,10 @@ impl<'a> Stands<'a> {
     }
 
     /// Returns the root mean square distance between the images of points of the heart at two sets of poses, pixels.
-    pub fn change_px(&self, targets: &Targets, a: &Poses, b: &Poses) -> f64 {
-        let reach = HEART_SHARE * 0.5 * targets.width.min(targets.height) as f64;
-        let points = [DVec3::ZERO, DVec3::X * reach, DVec3::Y * reach, DVec3::Z * reach];
-        let (seen_a, seen_b) = (self.seen(targets, a), self.seen(targets, b));
-        let squares = seen_a.iter().zip(&seen_b).flat_map(|(a, b)| {
-            points.map(|point| {
-                let ((_, u, v), (_, column, row)) = (a.project(point), b.project(point));
-                (u - column).powi(2) + (v - row).powi(2)
-            })
-        });
-        (squares.sum::<f64>() / (points.len() * seen_a.len()).max(1) as f64).sqrt()
+    pub fn change_px(&self, a: &Poses, b: &Poses) -> f64 {
+        let points = heart_points(&self.stands[0].rays, self.dataset.views[self.views[0]].size);
+        let frames = frame_rays(&self.stands, 0..self.stands.len(), [a, b]);
+        RigidMotion::none(self.dataset.n_phases as usize).remainder_px(&frames, &points)
     }
 
     /// Returns the dataset at other poses.

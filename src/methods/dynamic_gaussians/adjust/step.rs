@@ -1,41 +1,22 @@
 //! Gauss-Newton steps on poses, displacements of the heart and contrasts, with the field fixed.
 
-use crate::calibrate::pose::{Poses, ViewPose};
+use crate::calibrate::estimate::{Freedom, Normal, TEMPER, Unknown, Unknowns};
+use crate::calibrate::pose::{Poses, StatedView};
 use crate::error::{Error, Result};
-use crate::geometry::MM_PER_UNIT;
-use crate::linear::Symmetric;
 use crate::methods::dynamic_gaussians::adjust::poses::Stands;
 use crate::methods::dynamic_gaussians::adjust::residual::{ActiveImage, active_images};
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
 use crate::methods::dynamic_gaussians::targets::Targets;
-use glam::{DMat3, DVec3};
+use glam::DMat3;
 use rayon::prelude::*;
 
-/// Expected standard deviation of errors of the angles, degrees.
-const ANGLE_DEG: f64 = 0.3;
-/// Expected standard deviation of errors of the patient's position across the view, mm.
-const ACROSS_MM: f64 = 3.0;
-/// Expected standard deviation of errors of the patient's position along the view, mm.
-const DEPTH_MM: f64 = 1.0;
-/// Expected standard deviation of the heart's displacement by breathing along (posterior, left, superior), mm.
-const HEART_MM: [f64; 3] = [1.0, 0.6, 2.5];
-/// Expected standard deviation of the contrast of a frame.
-const CONTRAST: f64 = 0.2;
-/// Minimum contrast of a frame: images are divided by it.
-const MIN_CONTRAST: f64 = 0.3;
-/// Standard deviation of the mean contrast of all frames: the field's density determines it.
-const MEAN_CONTRAST: f64 = 1e-3;
-/// Residuals of neighbouring pixels are errors of the model and correlated: this many count as one.
-const TEMPER: f64 = 10.0;
 /// Step of central differences in positions, pixels at the isocentre.
 const POSITION_STEP: f64 = 0.1;
 /// Step of central differences in angles, degrees.
 const ANGLE_STEP_DEG: f64 = 0.1;
 
-/// Unknowns of a view: two angles, three translations.
+/// Number of unknowns of a view.
 const OF_VIEW: usize = 5;
-/// Unknowns of an image: three displacements of the heart, contrast.
-const OF_IMAGE: usize = 4;
 /// Columns of an image: derivatives by the unknowns of its view, and by its contrast.
 const COLUMNS: usize = OF_VIEW + 1;
 
@@ -61,22 +42,27 @@ impl<'a> FieldInLoop<'a> {
         self.trainer.images_through(&self.stands.seen(&self.targets, poses))
     }
 
-    /// Returns the derivatives of the field's images by the unknowns of their views, `[unknown][image][pixel]`: by the primary and the
-    /// secondary angle, per degree, and by the position along each axis, per world unit. They are central differences of images on the
-    /// device.
+    /// Axes of the stated C-arms.
+    fn axes(&self) -> Vec<DMat3> {
+        self.stands.stands.iter().map(StatedView::axes).collect()
+    }
+
+    /// Returns the derivatives of the field's images by the unknowns of their views ([`Unknown::of_view`]), `[unknown][image][pixel]`. They
+    /// are central differences of images on the device.
     ///
     /// # Errors
     /// Device errors.
     pub fn columns(&self, poses: &Poses) -> Result<Vec<Vec<f32>>> {
-        let length = POSITION_STEP * self.targets.units.pixel;
+        let (axes, length) = (self.axes(), POSITION_STEP * self.targets.units.pixel);
         let drawn_after = |unknown: usize, step: f64| {
             let mut poses = poses.clone();
-            poses.views.iter_mut().for_each(|pose| *pose = moved(*pose, unknown, step));
+            (0..axes.len()).for_each(|view| Unknown::of_view(view)[unknown].add(step, &axes, &mut poses));
             self.drawn(&poses)
         };
-        let column = |k: usize| -> Result<Vec<f32>> {
-            let step = if k < 2 { ANGLE_STEP_DEG } else { length };
-            let (ahead, behind) = (drawn_after(k, step)?, drawn_after(k, -step)?);
+        let column = |unknown: usize| -> Result<Vec<f32>> {
+            let is_angle = matches!(Unknown::of_view(0)[unknown], Unknown::Angle(..));
+            let step = if is_angle { ANGLE_STEP_DEG } else { length };
+            let (ahead, behind) = (drawn_after(unknown, step)?, drawn_after(unknown, -step)?);
             let slope = (0.5 / step) as f32;
             Ok(ahead.iter().zip(&behind).map(|(a, b)| (a - b) * slope).collect())
         };
@@ -103,26 +89,16 @@ impl<'a> FieldInLoop<'a> {
         if variance <= 0.0 {
             return Ok(poses.clone());
         }
-        let unknowns = Unknowns { n_views: poses.views.len(), n_images: images.len() };
-        let mut normal = Normal::new(unknowns.count());
-        for (k, (image, sums)) in images.iter().zip(&sums).enumerate() {
-            normal.add_image(&unknowns.of_columns(image.slot, k), sums, 1.0 / variance);
+        let mut frames = vec![Vec::new(); poses.views.len()];
+        images.iter().for_each(|image| frames[image.slot].push(image.phase));
+        let unknowns = Unknowns::new(self.axes(), Freedom::ALL, &frames);
+        let mut normal = Normal::zeros(unknowns.all.len());
+        for (image, sums) in images.iter().zip(&sums) {
+            sums.add_to(&mut normal, &unknowns, &unknowns.of_frame(image.slot, image.phase));
         }
-        self.add_priors(&mut normal, &unknowns, &images, poses);
-        let step = normal.matrix.solve(&normal.right).ok_or_else(|| {
+        normal.stepped(variance, &unknowns, poses).ok_or_else(|| {
             Error::Internal("the normal equations of the adjustment of poses are not positive definite".into())
-        })?;
-        let mut next = poses.clone();
-        for (slot, pose) in next.views.iter_mut().enumerate() {
-            (0..OF_VIEW).for_each(|k| *pose = moved(*pose, k, step[slot * OF_VIEW + k]));
-        }
-        for (k, image) in images.iter().enumerate() {
-            let of = &step[unknowns.image(k)..][..OF_IMAGE];
-            next.heart[image.slot][image.phase] += DVec3::from_slice(&of[..3]);
-            let gain = &mut next.gains[image.slot][image.phase];
-            *gain = (*gain + of[3]).max(MIN_CONTRAST - 1.0);
-        }
-        Ok(next)
+        })
     }
 
     /// Takes the contrasts of poses as those of the images.
@@ -133,71 +109,30 @@ impl<'a> FieldInLoop<'a> {
             self.targets.contrast[*image] = (1.0 + poses.gains[slot][phase]) as f32;
         }
     }
+}
 
-    /// Adds the expected deviations of all corrections from the stated geometry.
-    fn add_priors(&self, normal: &mut Normal, unknowns: &Unknowns, images: &[ActiveImage], poses: &Poses) {
-        for (slot, pose) in poses.views.iter().enumerate() {
-            let first = slot * OF_VIEW;
-            (0..2).for_each(|k| normal.add_prior(first + k, pose.angles_deg[k], ANGLE_DEG));
-            let axes = self.stands.stands[slot].corrected_axes(pose);
-            let precision = DVec3::new(ACROSS_MM, ACROSS_MM, DEPTH_MM).map(|mm| (MM_PER_UNIT / mm).powi(2));
-            let precision = axes * DMat3::from_diagonal(precision) * axes.transpose();
-            let pull = precision * pose.shift;
-            for i in 0..3 {
-                (0..=i).for_each(|j| normal.matrix.add(first + 2 + i, first + 2 + j, precision.col(j)[i]));
-                normal.right[first + 2 + i] -= pull[i];
+/// Returns the derivative by an unknown, per standard deviation of its prior, as factors on the columns of its view. A displacement of the
+/// heart changes an image as a translation of the view does.
+fn factors(unknown: Unknown, axes: &[DMat3]) -> [f64; COLUMNS] {
+    let mut factors = [0.0; COLUMNS];
+    match unknown {
+        Unknown::Angle(v, _) | Unknown::Shift(v, _) => {
+            let of_view = Unknown::of_view(v);
+            factors.iter_mut().zip(of_view).for_each(|(factor, u)| *factor = f64::from(u8::from(u == unknown)));
+        }
+        Unknown::Heart(v, _, axis) => {
+            for (factor, u) in factors.iter_mut().zip(Unknown::of_view(v)) {
+                let Unknown::Shift(_, along) = u else { continue };
+                *factor = axes[v].col(along)[axis];
             }
         }
-        let mut excess = 0.0;
-        for (k, image) in images.iter().enumerate() {
-            let (first, heart) = (unknowns.image(k), poses.heart[image.slot][image.phase]);
-            (0..3).for_each(|axis| normal.add_prior(first + axis, heart[axis], HEART_MM[axis] / MM_PER_UNIT));
-            let gain = poses.gains[image.slot][image.phase];
-            normal.add_prior(first + 3, gain, CONTRAST);
-            excess += gain;
-        }
-        // One row for the mean of all contrasts.
-        let share = 1.0 / images.len().max(1) as f64;
-        let weight = (share / MEAN_CONTRAST).powi(2);
-        for k in 0..images.len() {
-            (0..=k).for_each(|l| normal.matrix.add(unknowns.image(k) + 3, unknowns.image(l) + 3, weight));
-            normal.right[unknowns.image(k) + 3] -= weight * excess;
-        }
+        Unknown::Gain(..) => factors[OF_VIEW] = 1.0,
     }
+    factors.map(|factor| factor * unknown.deviation())
 }
 
-/// Returns a view's pose after a step of one unknown.
-fn moved(mut pose: ViewPose, unknown: usize, step: f64) -> ViewPose {
-    match unknown.checked_sub(2) {
-        None => pose.angles_deg[unknown] += step,
-        Some(axis) => pose.shift[axis] += step,
-    }
-    pose
-}
-
-/// Order of the unknowns: those of all views, then those of all images.
-struct Unknowns {
-    n_views: usize,
-    n_images: usize,
-}
-
-impl Unknowns {
-    fn count(&self) -> usize {
-        OF_VIEW * self.n_views + OF_IMAGE * self.n_images
-    }
-
-    /// First unknown of an image.
-    fn image(&self, image: usize) -> usize {
-        OF_VIEW * self.n_views + OF_IMAGE * image
-    }
-
-    /// Returns pairs of an unknown and the column of its derivatives. A translation of the view and a displacement of the heart have
-    /// the same derivatives.
-    fn of_columns(&self, slot: usize, image: usize) -> Vec<(usize, usize)> {
-        let view = (0..OF_VIEW).map(|k| (slot * OF_VIEW + k, k));
-        let heart = (0..3).map(|axis| (self.image(image) + axis, 2 + axis));
-        view.chain(heart).chain([(self.image(image) + 3, OF_VIEW)]).collect()
-    }
+fn dot(a: &[f64; COLUMNS], b: &[f64; COLUMNS]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
 /// Sums over the pixels of an image.
@@ -230,32 +165,12 @@ impl Sums {
         }
         sums
     }
-}
 
-/// Normal equations.
-struct Normal {
-    matrix: Symmetric,
-    right: Vec<f64>,
-}
-
-impl Normal {
-    fn new(n: usize) -> Normal {
-        Normal { matrix: Symmetric::zeros(n), right: vec![0.0; n] }
-    }
-
-    fn add_image(&mut self, unknowns: &[(usize, usize)], sums: &Sums, factor: f64) {
-        for (a, (i, column_i)) in unknowns.iter().enumerate() {
-            for (j, column_j) in &unknowns[..=a] {
-                self.matrix.add(*i, *j, factor * sums.products[*column_i][*column_j]);
-            }
-            self.right[*i] += factor * sums.right[*column_i];
-        }
-    }
-
-    /// Adds the expectation that a value is zero to within a standard deviation.
-    fn add_prior(&mut self, unknown: usize, value: f64, deviation: f64) {
-        let precision = 1.0 / deviation.powi(2);
-        self.matrix.add(unknown, unknown, precision);
-        self.right[unknown] -= precision * value;
+    /// Adds the image to the equations of unknowns with these indices.
+    fn add_to(&self, normal: &mut Normal, unknowns: &Unknowns, indices: &[usize]) {
+        let rows: Vec<_> = indices.iter().map(|i| factors(unknowns.all[*i], &unknowns.axes)).collect();
+        let product = |k: usize, l: usize| dot(&rows[k], &self.products.map(|products| dot(&products, &rows[l])));
+        // The residual is the image minus the field's.
+        normal.add(indices, product, |k| -dot(&rows[k], &self.right));
     }
 }
