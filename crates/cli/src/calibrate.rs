@@ -4,12 +4,12 @@ use super::calibration_table;
 use super::options::choice;
 use super::output::{CALIBRATION, KeptReferences, write_dataset};
 use clap::Args;
-use nertca_vk::calibrate::calibrate;
 use nertca_vk::calibrate::settings::{CalibrateMode, CalibrateSettings};
 use nertca_vk::error::Result;
 use nertca_vk::files;
 use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::scan::writer;
+use nertca_vk_runs::prepare::Prepared;
 use nertca_vk_runs::run::silhouette_pictures;
 use std::path::PathBuf;
 
@@ -43,7 +43,7 @@ pub fn run(args: &CalibrateArgs) -> Result<()> {
     // A dataset may be reconstructed with every preset, the default one included, whose field moves with each frame.
     let settings = CalibrateSettings { mode: args.mode, follows_breath: true };
     let calibration = write_dataset(&args.out, args.force, |out| {
-        let calibration = calibrate(&dataset, settings)?;
+        let calibration = Prepared::calibrated(&dataset, settings)?.calibration;
         let corrected = dataset.corrected(&calibration)?;
         let description = format!("calibrated from {}", dataset.path.display());
         let stated = |view| calibration.stated(view).cloned();

@@ -20,14 +20,13 @@ use nertca_vk_runs::run::info::RunInfo;
 use nertca_vk_runs::run::score::as_trained;
 use nertca_vk_runs::run::tree_score::score_tree;
 use nertca_vk_vessels::score::eval::Evaluation;
-use nertca_vk_vessels::trees::areas::measure_radii;
-use nertca_vk_vessels::trees::doubt::state_doubt;
+use nertca_vk_vessels::trees::doubt;
 use nertca_vk_vessels::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk_vessels::trees::files::{TreeFormat, note, write};
 use nertca_vk_vessels::trees::lesions::{Lesion, MeasuredBeat, lesions};
 use nertca_vk_vessels::trees::measurements;
 use nertca_vk_vessels::trees::over_frames;
-use nertca_vk_vessels::trees::tree::{BeatTree, CONFIDENCE, DOUBTFUL, TreeView};
+use nertca_vk_vessels::trees::tree::{BeatTree, CONFIDENCE, DOUBTFUL};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -182,15 +181,14 @@ pub fn found_in_phases(global: &GlobalOptions, gpu: &Gpu, model: &Model, phases:
 /// States in a tree what depends on the training views of its run: the views themselves, the radii and the doubt about each point.
 fn compare_with_views(beat: &mut BeatTree, dataset: &Dataset, run: &Path) -> Result<()> {
     let calibration = Calibration::read(run)?;
-    measure_in_views(beat, dataset);
-    state_doubt(beat, dataset, calibration.map_or(0.0, |calibration| calibration.disagreement_px));
+    let disagreement_px = calibration.map_or(0.0, |calibration| calibration.disagreement_px);
+    report(doubt::compare_with_views(beat, dataset, Some(disagreement_px)));
     Ok(())
 }
 
-/// States the training views of a dataset in a tree, and measures its radii in their images; says why where it cannot.
-fn measure_in_views(beat: &mut BeatTree, dataset: &Dataset) {
-    beat.views = TreeView::of(dataset);
-    if let Err(reason) = measure_radii(beat, dataset) {
+/// Says why the radii of a tree are those of the field, where they are.
+fn report(reason: Option<&str>) {
+    if let Some(reason) = reason {
         eprintln!("the radii of vessels are those of the field: {reason}");
     }
 }
@@ -215,7 +213,7 @@ pub fn compare_with_run(beat: &mut BeatTree, run: &Path) {
 /// means.
 pub fn measure_in_run(beat: &mut BeatTree, run: &Path, lacking: &str) {
     match dataset_of(run) {
-        Ok(dataset) => measure_in_views(beat, &dataset),
+        Ok(dataset) => report(doubt::compare_with_views(beat, &dataset, None)),
         Err(error) => eprintln!("{lacking}: {error}"),
     }
 }

@@ -7,6 +7,8 @@ use nertca_vk::{
 };
 use nertca_vk_vessels::{score, trees};
 
+pub mod prepare;
+
 /// One run, from a dataset to a run directory.
 pub mod run {
     mod curve;

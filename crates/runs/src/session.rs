@@ -4,7 +4,6 @@
 //! Threads: every function may be called from any thread at any time. Training holds the engine for a few iterations
 //! at a time; drawing never waits for more than those.
 
-mod adjusting;
 mod corrected;
 mod inbox;
 mod known;
@@ -31,10 +30,9 @@ use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::at_rest;
 use crate::scan::gating::{BeatTime, RPeaks};
 use crate::scan::prior::VesselPrior;
-use crate::trees::areas::measure_radii;
-use crate::trees::doubt::state_doubt;
+use crate::trees::doubt::compare_with_views;
 use crate::trees::extract::{TreeOptions, vessel_trees};
-use crate::trees::tree::{BeatTree, TreeView};
+use crate::trees::tree::BeatTree;
 pub use corrected::CorrectedFrame;
 pub use inbox::{FrameStatus, FrameTime, FrameUse, NewFrame, SessionOptions};
 use inbox::{Inbox, Kept};
@@ -541,11 +539,9 @@ impl Session {
         let dataset = lock(&self.shared.inbox).training_dataset();
         match dataset.and_then(|(dataset, _)| dataset.corrected(&calibration)) {
             Ok(dataset) if dataset.n_phases as usize == beat.phases.len() => {
-                beat.views = TreeView::of(&dataset);
-                if let Err(reason) = measure_radii(beat, &dataset) {
+                if let Some(reason) = compare_with_views(beat, &dataset, Some(calibration.disagreement_px)) {
                     tracing::info!("the radii of vessels are those of the field: {reason}");
                 }
-                state_doubt(beat, &dataset, calibration.disagreement_px);
             }
             Ok(_) => tracing::warn!("doubt is not stated: the frames have another number of phases than the field"),
             Err(error) => tracing::warn!("doubt is not stated: {error}"),

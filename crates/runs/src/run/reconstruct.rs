@@ -6,18 +6,18 @@
 use crate::calibrate::choose::Correction;
 use crate::calibrate::correction::Calibration;
 use crate::calibrate::gauge::RigidMotion;
-use crate::calibrate::{adjusted, calibrate};
 use crate::check;
 use crate::checkpoint::{self, Checkpoint};
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::files;
-use crate::fitting::fit::{AdjustTask, MadeFit, Start};
+use crate::fitting::fit::{MadeFit, Start};
 use crate::fitting::losses::LargeLoss;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
 use crate::methods;
 use crate::plan::Plan;
+use crate::prepare::Prepared;
 use crate::run::curve::{VALIDATION_IMAGES, thinned, validation_step};
 use crate::run::events::Event;
 use crate::run::log::MetricsLog;
@@ -185,12 +185,9 @@ fn calibrated(
     options: &RunOptions<'_>,
     observe: &mut dyn FnMut(&Event),
 ) -> Result<Calibrated> {
-    let mut made = None;
-    let calibration = if options.resume {
-        Calibration::read(options.run)?.unwrap_or_else(|| Calibration::none(None))
+    let Prepared { calibration, made } = if options.resume {
+        Prepared::known(Calibration::read(options.run)?.unwrap_or_else(|| Calibration::none(None)))
     } else {
-        let mut calibration = calibrate(dataset, config.calibration())?;
-        let task = AdjustTask { gpu, config, dataset, calibration: &calibration };
         let mut shown = None;
         let mut observe = |share: f64| {
             if options.cancel.load(Ordering::Relaxed) {
@@ -201,13 +198,10 @@ fn calibrated(
             }
             Ok(())
         };
-        let adjust = methods::of(config).abilities.adjust_views;
-        if let Some(outcome) = adjust.map_or(Ok(None), |adjust| adjust(&task, &mut observe))? {
-            calibration = adjusted(dataset, calibration, outcome.adjusted)?;
-            made = outcome.made;
-        }
-        calibration.write(options.run)?;
-        calibration
+        let views = Prepared::calibrated(dataset, config.calibration())?;
+        let views = views.adjusted(gpu, config, dataset, &mut observe)?;
+        views.calibration.write(options.run)?;
+        views
     };
     let corrected = dataset.corrected(&calibration)?;
     if !options.resume && calibration.correction != Correction::Stated {

@@ -2,11 +2,11 @@
 
 use crate::calibrate::correction::Calibration;
 use crate::error::{Error, Result};
-use crate::fitting::fit::{AdjustTask, FitField, Start, Use};
+use crate::fitting::fit::{FitField, Start, Use};
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
 use crate::plan::Plan;
-use crate::session::adjusting::{AdjustedViews, adjust};
+use crate::prepare::Prepared;
 use crate::session::state::{Shared, lock};
 use crate::train::trainer::Trainer;
 use std::sync::atomic::Ordering;
@@ -38,14 +38,23 @@ impl Shared {
         let tuning = beside_pictures(gpu, tuning);
         config.train.iterations_per_submit = tuning.iterations_per_submit.unwrap_or(config.train.iterations_per_submit);
         let calibration = lock(&self.calibration).clone().unwrap_or_else(|| Calibration::none(None));
-        let task = AdjustTask { gpu, config: &config, dataset: &stated, calibration: &calibration };
-        let proceed = || {
+        let mut told = 0;
+        let mut observe = |share: f64| {
             gpu.looks().give_way();
-            self.goes_on(version)
+            self.goes_on(version)?;
+            let tenths = (10.0 * share) as u32;
+            if tenths > told {
+                told = tenths;
+                tracing::info!("adjusting views, {:.0} %", 100.0 * share);
+            }
+            Ok(())
         };
-        let AdjustedViews { calibration, are_corrected, made } = adjust(&task, &proceed)?;
+        let views = Prepared::known(calibration).adjusted(gpu, &config, &stated, &mut observe)?;
+        views.calibration.adjustment.iter().for_each(|record| tracing::info!("{}", record.describe()));
         self.goes_on(version)?;
-        if !are_corrected && !lock(&self.engine).repeats {
+        let are_adjusted = views.are_adjusted();
+        let Prepared { calibration, made } = views;
+        if !are_adjusted && !lock(&self.engine).repeats {
             lock(&self.engine).refined = version;
             *lock(&self.calibration) = Some(calibration);
             return Ok(AfterTraining::Ended);

@@ -1,12 +1,12 @@
 //! Training of a session: new frames are taken in, and iterations run in the background.
 
-use crate::calibrate::calibrate;
 use crate::error::{Error, Result};
 use crate::fitting::fit::{FitField, Start, Use};
 use crate::methods;
 use crate::model::Model;
 use crate::model::scene::Scene;
 use crate::plan::Plan;
+use crate::prepare::Prepared;
 use crate::render::live::Source;
 use crate::session::progress::{Observer, Progress, State};
 use crate::session::refining::{AfterTraining, beside_pictures};
@@ -48,7 +48,7 @@ impl Shared {
         }
         let tuning = beside_pictures(gpu, tuning);
         dataset.notes.iter().for_each(|note| tracing::info!("{note}"));
-        let calibration = calibrate(&dataset, config.calibration())?;
+        let calibration = Prepared::calibrated(&dataset, config.calibration())?.calibration;
         calibration.notes.iter().for_each(|note| tracing::info!("{note}"));
         let dataset = dataset.corrected(&calibration)?;
         let fresh = Plan::new(&config, &dataset)?;

@@ -11,11 +11,12 @@ use crate::evidence::series::Series;
 use crate::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
 use crate::raster::percentile;
 use crate::scan::dataset::Dataset;
+use crate::trees::areas::measure_radii;
 use crate::trees::information::Information;
 use crate::trees::refine::tangents;
 use crate::trees::ridges::ridge_offset;
 use crate::trees::sight::TreeInView;
-use crate::trees::tree::{BeatTree, CONFIDENCE, Doubt, PhaseTree};
+use crate::trees::tree::{BeatTree, CONFIDENCE, Doubt, PhaseTree, TreeView};
 use glam::{DVec2, DVec3};
 
 /// Error of a view's image of a centreline, as a share of the distance to the ridges that [`CONFIDENCE`] of the points have: a point
@@ -46,10 +47,25 @@ const EXISTENCE_OF_MORE: [(f64, f64); 5] = [(0.2, 0.77), (0.49, 0.85), (0.71, 0.
 /// Probability that a point of a single fit exists: with two views, and with more.
 const EXISTENCE_SINGLE: [f64; 2] = [0.61, 0.997];
 
+/// States in a tree what depends on the training views of its dataset: the views themselves, the radii that their images show, and, with
+/// the disagreement of the views as stated, px, the doubt about each point. Returns why radii remain those of the field, where they do.
+pub fn compare_with_views(
+    beat: &mut BeatTree,
+    dataset: &Dataset,
+    disagreement_px: Option<f64>,
+) -> Option<&'static str> {
+    beat.views = TreeView::of(dataset);
+    let reason = measure_radii(beat, dataset).err();
+    if let Some(disagreement_px) = disagreement_px {
+        state_doubt(beat, dataset, disagreement_px);
+    }
+    reason
+}
+
 /// States the doubt about all points of a tree. The dataset has the geometry that the reconstruction used, and
 /// `disagreement_px` is the disagreement of its views as stated ([`crate::calibrate::correction::Calibration::disagreement_px`]). A phase
 /// that the dataset does not have is compared with no image. Large images are binned: in small pixels, noise moves the ridges.
-pub fn state_doubt(beat: &mut BeatTree, dataset: &Dataset, disagreement_px: f64) {
+fn state_doubt(beat: &mut BeatTree, dataset: &Dataset, disagreement_px: f64) {
     let views = dataset.training_views();
     let Some(first) = views.first() else { return };
     let pixel_mm = |dataset: &Dataset| dataset.views[*first].rays.anchor[1].length() * MM_PER_UNIT;
