@@ -6,7 +6,6 @@ use crate::error::{Error, Result};
 use crate::fitting::fit::{Advance, FitProgress, FitWork, Iterates, Measured};
 use crate::fitting::losses::StepLoss;
 use crate::gaussians::field::GaussianField;
-use crate::gaussians::work::GaussianWork;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
 use crate::methods::dynamic_gaussians::carried::{can_go_on, explains_all};
@@ -28,6 +27,19 @@ pub(crate) enum GaussianFit {
     Deformable(Box<DeformableTrainer>, Option<Box<Fine>>),
     /// A fit that was made before.
     Made(Box<Made>),
+}
+
+/// Position of a fit of Gaussians.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Position {
+    /// Iterations done.
+    pub(crate) step: u32,
+    /// Share done of the preparation before the first iteration; none when that has begun.
+    pub(crate) preparation: Option<f64>,
+    /// Whether the fit uses coarser images so far.
+    pub(crate) is_coarse: bool,
+    /// Whether the field is worth more than one that was fitted to fewer frames.
+    pub(crate) is_presentable: bool,
 }
 
 impl GaussianFit {
@@ -64,40 +76,17 @@ impl GaussianFit {
         Ok(GaussianFit::Start(Box::new(DeformableStart::new(gpu, targets, config)?), fine))
     }
 
-    /// Tells whether the field of a fit of `end` iterations is worth more than one that was fitted to fewer frames. A fit starts again
-    /// only where the earlier field does not explain a view or a phase, so that a set per phase is worth more already.
-    pub(crate) fn is_presentable(&self, end: u32) -> bool {
-        match self {
-            GaussianFit::PerPhase(fit) => fit.step() >= end / 2,
-            GaussianFit::Start(start, _) => start.has_set_per_phase(),
-            GaussianFit::Deformable(..) | GaussianFit::Made(_) => true,
-        }
-    }
-
-    /// Tells whether the fit uses coarser images so far.
-    pub(crate) fn is_coarse(&self) -> bool {
-        match self {
-            GaussianFit::Start(_, fine) | GaussianFit::Deformable(_, fine) => fine.is_some(),
-            GaussianFit::PerPhase(_) | GaussianFit::Made(_) => false,
-        }
-    }
-
-    /// Iterations done.
-    pub(crate) fn step(&self) -> u32 {
-        match self {
-            GaussianFit::PerPhase(fit) => fit.step(),
-            GaussianFit::Start(..) => 0,
-            GaussianFit::Deformable(fit, _) => fit.step(),
-            GaussianFit::Made(fit) => fit.step(),
-        }
-    }
-
-    /// Share done of the preparation before the first iteration; none when that has begun.
-    pub(crate) fn preparation(&self) -> Option<f64> {
-        match self {
-            GaussianFit::Start(start, _) => Some(start.share()),
-            GaussianFit::PerPhase(_) | GaussianFit::Deformable(..) | GaussianFit::Made(_) => None,
-        }
+    /// Returns the position of the fit, which ends after `end` iterations.
+    pub(crate) fn position(&self, end: u32) -> Position {
+        let is_coarse = |fine: &Option<Box<Fine>>| fine.is_some();
+        let (step, preparation, is_coarse, is_presentable) = match self {
+            // A fit starts again only where the earlier field does not explain a view or a phase.
+            GaussianFit::PerPhase(fit) => (fit.step(), None, false, fit.step() >= end / 2),
+            GaussianFit::Start(start, fine) => (0, Some(start.share()), is_coarse(fine), start.has_set_per_phase()),
+            GaussianFit::Deformable(fit, fine) => (fit.step(), None, is_coarse(fine), true),
+            GaussianFit::Made(fit) => (fit.step(), None, false, true),
+        };
+        Position { step, preparation, is_coarse, is_presentable }
     }
 
     /// Runs some iterations towards `until`; returns their losses, none while a deformable set is in preparation.
@@ -148,51 +137,6 @@ impl GaussianFit {
             GaussianFit::PerPhase(_) | GaussianFit::Start(..) => Vec::new(),
         }
     }
-
-    /// Number of Gaussians.
-    pub(crate) fn count(&self) -> u32 {
-        match self {
-            GaussianFit::PerPhase(fit) => fit.count(),
-            GaussianFit::Start(start, _) => start.count(),
-            GaussianFit::Deformable(fit, _) => fit.count(),
-            GaussianFit::Made(fit) => fit.field().rows().rows.len() as u32,
-        }
-    }
-
-    /// Name of the form of the field that it fits.
-    fn form(&self) -> &'static str {
-        match self {
-            GaussianFit::PerPhase(_) => GaussianForm::Phase.name(),
-            GaussianFit::Start(..) | GaussianFit::Deformable(..) => GaussianForm::Deformable.name(),
-            GaussianFit::Made(fit) => fit.field().form(),
-        }
-    }
-
-    /// Runs one iteration with a timestamp around each pass.
-    ///
-    /// # Errors
-    /// Device errors.
-    pub(crate) fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        match self {
-            GaussianFit::PerPhase(fit) => fit.profile_step(),
-            GaussianFit::Start(..) => Err(not_begun()),
-            GaussianFit::Deformable(fit, _) => fit.profile_step(),
-            GaussianFit::Made(_) => Err(not_begun()),
-        }
-    }
-
-    /// Work of the last iteration.
-    ///
-    /// # Errors
-    /// Device errors.
-    pub(crate) fn work(&self) -> Result<GaussianWork> {
-        match self {
-            GaussianFit::PerPhase(fit) => fit.work(),
-            GaussianFit::Start(..) => Err(not_begun()),
-            GaussianFit::Deformable(fit, _) => fit.work(),
-            GaussianFit::Made(_) => Err(not_begun()),
-        }
-    }
 }
 
 fn not_begun() -> Error {
@@ -201,11 +145,12 @@ fn not_begun() -> Error {
 
 impl Iterates for GaussianFit {
     fn progress(&self) -> FitProgress {
-        FitProgress { preparation: self.preparation(), ..FitProgress::at(self.step()) }
+        let Position { step, preparation, .. } = self.position(u32::MAX);
+        FitProgress { preparation, ..FitProgress::at(step) }
     }
 
     fn advance(&mut self, until: u32) -> Result<Advance> {
-        let first = self.step() + 1;
+        let first = self.progress().step + 1;
         let losses = GaussianFit::advance(self, until)?.into_iter().zip(first..);
         Ok(Advance::of(losses.map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect()))
     }
@@ -213,11 +158,19 @@ impl Iterates for GaussianFit {
 
 impl Measured for GaussianFit {
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        GaussianFit::profile_step(self)
+        match self {
+            GaussianFit::PerPhase(fit) => fit.profile_step(),
+            GaussianFit::Deformable(fit, _) => fit.profile_step(),
+            GaussianFit::Start(..) | GaussianFit::Made(_) => Err(not_begun()),
+        }
     }
 
     fn work(&self) -> Result<Option<FitWork>> {
-        let form = Some(self.form());
-        Ok(Some(FitWork { form, count: self.count(), work: GaussianFit::work(self)? }))
+        let (form, count, work) = match self {
+            GaussianFit::PerPhase(fit) => (GaussianForm::Phase, fit.count(), fit.work()?),
+            GaussianFit::Deformable(fit, _) => (GaussianForm::Deformable, fit.count(), fit.work()?),
+            GaussianFit::Start(..) | GaussianFit::Made(_) => return Err(not_begun()),
+        };
+        Ok(Some(FitWork { form: Some(form.name()), count, work }))
     }
 }

@@ -4,7 +4,7 @@ use crate::error::{Error, Result};
 use crate::gaussians::field::GaussianField;
 use crate::gpu::device::Gpu;
 use crate::methods::dynamic_gaussians::deformable::Earlier;
-use crate::methods::dynamic_gaussians::fit::GaussianFit;
+use crate::methods::dynamic_gaussians::fit::{GaussianFit, Position};
 use crate::methods::dynamic_gaussians::made::{Made, MadeGaussians};
 use crate::methods::dynamic_gaussians::rules::Rules;
 use crate::methods::dynamic_gaussians::setup;
@@ -100,46 +100,27 @@ impl Repeated {
                 GaussianFit::new(gpu, targets, config, earlier)?
             }
         };
-        let begins_coarse = fit.is_coarse();
+        let begins_coarse = fit.position(config.gaussian_iterations()).is_coarse;
         Ok(Repeated { gpu: gpu.clone(), config: config.clone(), fits, fit, stage, begins_coarse })
     }
 
-    /// Tells whether the field of a fit of `end` iterations is worth more than one that was fitted to fewer frames.
-    pub(crate) fn is_presentable(&self, end: u32) -> bool {
-        match &self.stage {
-            Stage::Run { mean: None } => self.fit.is_presentable(end),
-            Stage::First { .. } => false,
-            Stage::Run { mean: Some(_) } | Stage::Other { .. } => true,
-        }
-    }
-
-    /// Tells whether the run's iterations use coarser images so far.
-    pub(crate) fn is_coarse(&self) -> bool {
-        match &self.stage {
-            Stage::Run { .. } => self.fit.is_coarse(),
-            Stage::First { .. } | Stage::Other { .. } => self.begins_coarse,
-        }
-    }
-
-    /// Returns the iterations of the run that are done.
-    pub(crate) fn step(&self) -> u32 {
-        match &self.stage {
-            Stage::Run { .. } => self.fit.step(),
-            Stage::First { .. } | Stage::Other { .. } => 0,
-        }
-    }
-
-    /// Returns the share done of the preparation before the first iteration of the run; none when that has begun.
-    pub(crate) fn preparation(&self) -> Option<f64> {
-        let of_fit = self.fit.preparation();
-        let iterated = f64::from(self.fit.step()) / f64::from(self.config.gaussian_iterations().max(1));
-        let done = match &self.stage {
-            Stage::Run { .. } => return of_fit,
-            Stage::First { .. } => of_fit.map_or(0.5 + 0.5 * iterated, |share| 0.5 * share),
+    /// Returns the position of the run.
+    pub(crate) fn position(&self) -> Position {
+        let end = self.config.gaussian_iterations();
+        let fit = self.fit.position(end);
+        let iterated = f64::from(fit.step) / f64::from(end.max(1));
+        let (done, is_presentable) = match &self.stage {
+            Stage::Run { mean } => {
+                return Position { is_presentable: mean.is_some() || fit.is_presentable, ..fit };
+            }
+            Stage::First { .. } => (fit.preparation.map_or(0.5 + 0.5 * iterated, |share| 0.5 * share), false),
             // The run's fit was prepared before; the others need no preparation.
-            Stage::Other { others, .. } => (others.len() + 1) as f64 + of_fit.map_or(iterated, |share| 0.5 * share),
+            Stage::Other { others, .. } => {
+                ((others.len() + 1) as f64 + fit.preparation.map_or(iterated, |share| 0.5 * share), true)
+            }
         };
-        Some(done / f64::from(self.fits))
+        let preparation = Some(done / f64::from(self.fits));
+        Position { step: 0, preparation, is_coarse: self.begins_coarse, is_presentable }
     }
 
     /// Runs some iterations towards `until`; returns the losses of those of the run, and findings about the data, for the user.
@@ -159,7 +140,7 @@ impl Repeated {
             Stage::First { losses: all, .. } => all.append(&mut losses),
             Stage::Other { .. } => {}
         }
-        if self.fit.step() < end {
+        if self.fit.position(end).step < end {
             return Ok(Default::default());
         }
         let findings = self.findings_of(number);

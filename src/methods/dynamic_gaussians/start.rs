@@ -138,15 +138,6 @@ impl DeformableStart {
             Stage::Over => Err(Error::Internal("the deformable set was handed over already".into())),
         }
     }
-
-    /// Number of Gaussians.
-    pub fn count(&self) -> u32 {
-        match &self.stage {
-            Stage::Warming(first) => first.count(),
-            Stage::Tracking(under_way) => under_way.trainer.count(),
-            Stage::Over => 0,
-        }
-    }
 }
 
 /// In which order phases are tracked, each from the two before it: forward and backward from the phase of rest to the

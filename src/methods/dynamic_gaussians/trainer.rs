@@ -12,6 +12,7 @@ use crate::gaussians::pictures::Pictures;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
 use crate::methods::dynamic_gaussians::data::{GaussianData, Shot};
+use crate::methods::dynamic_gaussians::fit::Position;
 use crate::methods::dynamic_gaussians::repeated::Repeated;
 use crate::methods::dynamic_gaussians::rules::Rules;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -51,7 +52,7 @@ impl GaussiansFit {
             None => {
                 let made = from.made.and_then(|made| made.downcast_ref());
                 let mut fit = Repeated::new(gpu, targets, config, earlier, made)?;
-                while fit.step() < done {
+                while fit.position().step < done {
                     findings.append(&mut fit.advance(done)?.1);
                 }
                 let field = fit.field()?;
@@ -59,10 +60,10 @@ impl GaussiansFit {
             }
         };
         let shown = earlier.or(gaussians_to(Use::Show));
-        let shown = shown.filter(|_| gaussians.as_ref().is_some_and(|fit| !fit.is_presentable(end)));
+        let shown = shown.filter(|_| gaussians.as_ref().is_some_and(|fit| !fit.position().is_presentable));
         let shows_earlier = shown.is_some();
         let done = match &gaussians {
-            Some(fit) => fit.step(),
+            Some(fit) => fit.position().step,
             None => saved_fields.map_or(0, |saved| saved.step()),
         };
         let fields = FieldsFit::awaiting_images(gpu, fields, start.tuning.clone(), saved_fields, done)?;
@@ -95,13 +96,14 @@ impl GaussiansFit {
     /// Runs some iterations of the Gaussians towards `until`, and ends their fit after `end` iterations.
     fn advance_gaussians(&mut self, until: u32, end: u32) -> Result<Advance> {
         let Some(fit) = &mut self.gaussians else { return Ok(Advance::default()) };
-        let was_coarse = fit.is_coarse();
+        let was_coarse = fit.position().is_coarse;
         let (losses, found) = fit.advance(until.min(end))?;
-        let has_new_objective = was_coarse && !fit.is_coarse();
-        self.shows_earlier &= !fit.is_presentable(end);
+        let Position { step, is_coarse, is_presentable, .. } = fit.position();
+        let has_new_objective = was_coarse && !is_coarse;
+        self.shows_earlier &= !is_presentable;
         if !self.shows_earlier {
             let field = fit.field()?;
-            if fit.step() >= end {
+            if step >= end {
                 self.gaussians = None;
             }
             let mut feed = self.feed.lock().unwrap_or_else(PoisonError::into_inner);
@@ -131,7 +133,7 @@ impl GaussiansFit {
 
 impl Iterates for GaussiansFit {
     fn progress(&self) -> FitProgress {
-        let preparation = self.gaussians.as_ref().and_then(Repeated::preparation);
+        let preparation = self.gaussians.as_ref().and_then(|fit| fit.position().preparation);
         FitProgress { preparation, shows_earlier: self.shows_earlier, ..self.fields.progress() }
     }
 
