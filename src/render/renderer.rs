@@ -127,8 +127,9 @@ impl Renderer {
     pub fn new(gpu: &Gpu, model: &Model, tuning: Tuning) -> Result<Renderer> {
         let tuning = tuning.for_network(model.config.has_network());
         let (samples, hull) = (model.config.render.render_samples, model.hull.as_ref());
-        let mut setup = match model.config.fields() {
-            Some(settings) => model.scene.setup(&settings, &model.param_map, hull),
+        let fields = model.config.fields();
+        let mut setup = match &fields {
+            Some(settings) => model.scene.setup(settings, &model.param_map, hull),
             None => model.scene.placed(&model.param_map, hull),
         };
         setup.sample_capacity = sample_capacity(model.config.train.chunk_samples.max(samples));
@@ -137,7 +138,7 @@ impl Renderer {
         // Nothing is penalised, and a rendering has no batch whose last ray could decide.
         setup.occlusion_share = 0.0;
         setup.n_static_samples = samples;
-        if model.gaussians.is_none() {
+        if model.gaussians.is_none() || fields.is_none() {
             setup.n_dynamic_samples = samples;
         }
         let limit = model.param_map.dynamic_network.as_ref().map_or(u32::MAX, |map| largest_chunk(gpu, &tuning, map));
