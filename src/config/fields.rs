@@ -174,10 +174,10 @@ impl Occupancy {
 impl Network {
     /// Refuses shapes that no kernel computes.
     pub(super) fn check_shape(&self) -> Result<()> {
-        if self.width % 16 != 0 {
+        if !self.width.is_multiple_of(16) {
             return Err(Error::config("dynamic.width", self.width, "is not a multiple of 16"));
         }
-        if self.latent % 4 != 0 {
+        if !self.latent.is_multiple_of(4) {
             return Err(Error::config("dynamic.latent", self.latent, "is not a multiple of 4"));
         }
         if self.skip_layer == 1 || self.skip_layer > self.layers {

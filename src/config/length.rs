@@ -82,10 +82,10 @@ mod tests {
 
     #[test]
     fn shortened_runs_keep_the_shares_of_density_control_but_not_every_iteration() {
-        let r2 = |length| Config::preset(Preset::R2Gaussian).of_length(length).of::<R2Settings>().unwrap().r2;
+        let r2 = |length| Config::preset(Preset::R2Gaussian).of_length(length).of::<R2Settings>().unwrap().r2.clone();
         assert_eq!((r2(6000).densify_every, r2(6000).densify_from), (20, 100));
         assert_eq!((r2(1000).densify_every, r2(1000).densify_from), (10, 17));
-        let x = Config::preset(Preset::XGaussian).of_length(2000).of::<XSettings>().unwrap().x;
+        let x = Config::preset(Preset::XGaussian).of_length(2000).of::<XSettings>().unwrap().x.clone();
         assert_eq!((x.densify_every, x.densify_from, x.densify_until), (20, 50, 800));
         assert_eq!((x.reset_every, x.degree_every), (400, 100));
     }

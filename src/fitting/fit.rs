@@ -52,15 +52,22 @@ pub struct Method {
 pub struct Abilities {
     /// Adjusts the calibrated geometry of views with the field in the loop; returns none where the data do not allow it. Fails with
     /// errors of the device and of the observer.
-    pub adjust_views: Option<fn(&AdjustTask<'_>, &mut Observe<'_>) -> Result<Option<AdjustedFit>>>,
+    pub adjust_views: Option<AdjustViews>,
     /// Estimates the memory of a run, from the number and the size of its images, on a device whose buffers have at most this many
     /// bytes; returns none for settings without an estimate.
-    pub estimate_memory: Option<fn(&Config, &Dataset, u64) -> Option<MemoryEstimate>>,
+    pub estimate_memory: Option<EstimateMemory>,
     /// Repeats fits to the same data, whose mean is the field.
     pub repeat_fits: Option<RepeatFits>,
     /// Begins a fit from scratch for measurements of its Gaussians.
-    pub time_gaussians: Option<fn(&dyn FitData, &FitStart<'_>) -> Result<Box<dyn Measured>>>,
+    pub time_gaussians: Option<TimeGaussians>,
 }
+
+/// Function that adjusts the calibrated geometry of views.
+pub type AdjustViews = fn(&AdjustTask<'_>, &mut Observe<'_>) -> Result<Option<AdjustedFit>>;
+/// Function that estimates the memory of a run.
+pub type EstimateMemory = fn(&Config, &Dataset, u64) -> Option<MemoryEstimate>;
+/// Function that begins a fit for measurements.
+pub type TimeGaussians = fn(&dyn FitData, &FitStart<'_>) -> Result<Box<dyn Measured>>;
 
 impl Abilities {
     /// Returns the abilities of a method that has none.

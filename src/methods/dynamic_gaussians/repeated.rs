@@ -68,9 +68,9 @@ enum Stage {
     /// The run's fit: the only one, or its iterations again, to report them, with the mean of all fits.
     Run { mean: Option<GaussianField> },
     /// The first of several fits.
-    First { images: Targets, losses: Vec<f64> },
+    First { images: Box<Targets>, losses: Vec<f64> },
     /// One of the other fits, with the images for those after it, and the mean of those before it.
-    Other { images: Option<Targets>, first: Made, others: Vec<GaussianField>, mean: GaussianField },
+    Other { images: Option<Box<Targets>>, first: Box<Made>, others: Vec<GaussianField>, mean: GaussianField },
 }
 
 impl Repeated {
@@ -90,7 +90,7 @@ impl Repeated {
         let fits = if earlier.is_some() { 1 } else { targets.fits(config.fits).0.max(1) };
         let stage = match fits {
             1 => Stage::Run { mean: None },
-            _ => Stage::First { images: targets.clone(), losses: Vec::new() },
+            _ => Stage::First { images: Box::new(targets.clone()), losses: Vec::new() },
         };
         let fit = match made.and_then(|made| Made::of(made, &targets, config)) {
             Some(made) => GaussianFit::Made(Box::new(made)),
@@ -160,7 +160,7 @@ impl Repeated {
         let field = self.fit.field()?;
         let (images, first, others) = match std::mem::replace(&mut self.stage, Stage::Run { mean: None }) {
             Stage::Run { .. } => return Ok(()),
-            Stage::First { images, losses } => (Some(images), Made::done(field, losses), Vec::new()),
+            Stage::First { images, losses } => (Some(images), Box::new(Made::done(field, losses)), Vec::new()),
             Stage::Other { images, first, mut others, .. } => {
                 others.push(field);
                 (images, first, others)
@@ -168,14 +168,14 @@ impl Repeated {
         };
         let mean = mean(&std::iter::once(first.field()).chain(&others).cloned().collect::<Vec<_>>())?;
         let Some(images) = images else {
-            (self.fit, self.stage) = (GaussianFit::Made(Box::new(first)), Stage::Run { mean: Some(mean) });
+            (self.fit, self.stage) = (GaussianFit::Made(first), Stage::Run { mean: Some(mean) });
             return Ok(());
         };
         let number = others.len() as u32 + 1;
         let seed = self.config.seed.wrapping_add(NEXT_SEED * number);
         let left = (number + 1 < self.fits).then(|| images.clone());
         let earlier = first.field().moving().map(|field| Earlier { field, step: 0, reseeds: true });
-        self.fit = GaussianFit::new(&self.gpu, images, &Rules { seed, ..self.config.clone() }, earlier)?;
+        self.fit = GaussianFit::new(&self.gpu, *images, &Rules { seed, ..self.config.clone() }, earlier)?;
         self.stage = Stage::Other { images: left, first, others, mean };
         Ok(())
     }
