@@ -67,6 +67,13 @@ pub enum Preset {
     SaxNerf,
 }
 
+impl Preset {
+    /// Tells whether the preset is the method of the paper with its published settings, as the paper or its public code state them.
+    pub fn is_published(self) -> bool {
+        matches!(self, Preset::Paper | Preset::PublicCode)
+    }
+}
+
 impl Config {
     /// Returns the defaults of a preset.
     pub fn preset(preset: Preset) -> Config {

@@ -1,4 +1,4 @@
-//! What the settings of a method offer, and the declaration of the methods.
+//! Interface of the settings of a method, and the declaration of the methods.
 
 use crate::config::Method;
 use crate::config::common::Train;

@@ -147,9 +147,22 @@ impl Config {
         let of_another = |preset: &Preset| Config::preset(*preset).acts(key);
         let problem = match Preset::ALL.iter().any(of_another) {
             true => format!("has no effect with the preset `{}`; {}", self.preset.name(), self.see()),
-            false => format!("unknown key; {}", self.see()),
+            false => format!("unknown key; the known keys are: {}", self.known(key).join(", ")),
         };
         Error::config(key, value, problem)
+    }
+
+    /// Returns the keys of the section of a key, or all sections where there is no such section.
+    fn known(&self, key: &str) -> Vec<String> {
+        let Ok(table) = self.table() else { return Vec::new() };
+        let section = key.split_once('.').map_or("", |(section, _)| section);
+        match table.get(section).and_then(Value::as_table) {
+            Some(values) => {
+                let keys = values.keys().map(|name| format!("{section}.{name}"));
+                keys.filter(|key| self.acts(key)).collect()
+            }
+            None => table.keys().cloned().collect(),
+        }
     }
 
     fn see(&self) -> String {

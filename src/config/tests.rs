@@ -142,7 +142,9 @@ fn constants_are_refused_with_their_value() {
     // A value that changes nothing is no mistake.
     load(Preset::Fast, "gaussians.grow_at=50").unwrap();
     let message = refusal(Preset::Fast, "gaussians.cut=3");
-    assert!(message.contains("unknown key") && message.contains("--print-config"), "{message}");
+    assert!(message.contains("unknown key") && message.contains("gaussians.count"), "{message}");
+    let message = refusal(Preset::Fast, "gauss.count=3");
+    assert!(message.contains("unknown key") && message.contains("gaussians"), "{message}");
 }
 
 #[test]

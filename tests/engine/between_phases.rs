@@ -72,7 +72,7 @@ fn a_moving_tree_is_fitted_to_frames_at_their_own_time() {
         |plan: &Plan, fate: &str| plan.notes.iter().any(|n| n.starts_with(&format!("{taken} of")) && n.contains(fate));
     assert!(told(&plan, "fitted at their own time"), "{:?}", plan.notes);
     assert!(told(&planned("phase"), "are used as frames of the nearest phase"));
-    let network = planned("none");
+    let network = Plan::new(&Config::preset(Preset::FastMlp), &dataset).unwrap();
     assert!(told(&network, "trained at their own time"), "{:?}", network.notes);
     for (row, frame) in network.data::<FieldData>().unwrap().frames.iter().zip(dataset.training()) {
         let own_time = if frame.phase == 1 { (1, 2, 0.25) } else { (frame.phase, (frame.phase + 1) % 3, 0.0) };

@@ -752,7 +752,7 @@ mod tests {
     fn versions_agree() {
         let macros = format!("{NERTCA_VERSION_MAJOR}.{NERTCA_VERSION_MINOR}.{NERTCA_VERSION_PATCH}");
         assert_eq!(macros, env!("CARGO_PKG_VERSION"));
-        let cmake = std::fs::read_to_string("include/cmake/nertca_vkConfigVersion.cmake").unwrap();
+        let cmake = include_str!("../../../include/cmake/nertca_vkConfigVersion.cmake");
         assert!(cmake.contains(&format!("PACKAGE_VERSION {macros})")));
     }
 }

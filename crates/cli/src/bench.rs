@@ -8,7 +8,7 @@ use nertca_vk::bench::peaks::peaks;
 use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
 use nertca_vk::config::sections::Train;
-use nertca_vk::config::{Config, Preset};
+use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::fitting::ledger::Ledger;
 use nertca_vk::gpu::device::Gpu;
@@ -270,7 +270,7 @@ fn run_whole(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning, scr
 /// Tells whether iterations do the same work as the paper's, so that a comparison with its 37 minutes is fair whatever the
 /// result: all settings that affect the work are those of one of its presets.
 fn is_of_the_paper(config: &Config) -> bool {
-    if !matches!(config.preset, Preset::Paper | Preset::PublicCode) {
+    if !config.preset.is_published() {
         return false;
     }
     let mut same = Config::preset(config.preset);

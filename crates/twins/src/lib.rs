@@ -1,5 +1,5 @@
-//! What a device computes, beside f64 twins of the compute stages, and what its driver makes of them. Tests and `nertca-vk selftest` use
-//! this crate; no result depends on it.
+//! f64 twins of the compute stages, the self-test that compares a device with them, and the inventory of pipelines as its driver compiles
+//! them. Tests and `nertca-vk selftest` use this crate; no result depends on it.
 
 use nertca_vk::{
     choice, config, error, fields, fitting, formats, gaussians, geometry, gpu, kernels, methods, model, network, plan,
