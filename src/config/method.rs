@@ -38,7 +38,7 @@ pub(crate) trait MethodSettings: Sections {
     /// Refuses settings that the method does not support, or that contradict each other.
     ///
     /// # Errors
-    /// [`Error::Config`] naming the key.
+    /// [`crate::error::Error::Config`] naming the key.
     fn check(&self, shared: &Shared<'_>) -> Result<()>;
 
     /// Returns the settings of fields that rays are marched through; none for a method without such fields.

@@ -1,5 +1,5 @@
-//! The loop of a run: iterations go to the device, losses come back as progress. [`crate::run`] drives it towards a run
-//! directory, [`crate::session`] in memory.
+//! The loop of a run: iterations go to the device, losses come back as progress. `run` drives it towards a run
+//! directory, `session` in memory.
 
 use crate::error::Result;
 use crate::fitting::losses::StepLoss;
