@@ -22,9 +22,10 @@ mod section;
 mod tests;
 mod x_gaussian;
 
-pub use choices::{AdjustMode, Decay, DynamicTarget, GaussianForm, OcclusionRegion, R2Integral, R2Start, StaticData};
+pub use choices::{AdjustMode, Decay, DynamicTarget, OcclusionRegion, R2Integral, R2Start, StaticData};
 pub use configuration::Config;
 pub(crate) use configuration::Shared;
+pub use dynamic_gaussians::GaussianForm;
 pub use method::OfMethod;
 use method::methods;
 use sections::{GaussiansSettings, NerfCaSettings, NertCaSettings, R2Settings, SaxSettings, XSettings};
@@ -34,7 +35,7 @@ use strum::{IntoStaticStr, VariantArray};
 /// Sections of a configuration and the settings of each method: each hyper-parameter with its meaning and accepted range.
 pub mod sections {
     pub use crate::config::common::{Calibrate, Render, Train};
-    pub use crate::config::dynamic_gaussians::{Deformable, Gaussians, GaussiansSettings};
+    pub use crate::config::dynamic_gaussians::{Deformable, Gaussians, GaussiansSettings, Rule};
     pub use crate::config::fields::{Network, Networks, Tensor};
     pub use crate::config::nerf_ca::NerfCaSettings;
     pub use crate::config::nert_ca::{NertCaHull, NertCaSettings};

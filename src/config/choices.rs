@@ -1,4 +1,4 @@
-//! Choices of a configuration by name: forms of Gaussians, data of a fit, regions of losses, corrections.
+//! Choices of a configuration by name: data of a fit, regions of losses, corrections.
 
 use serde::{Deserialize, Serialize};
 use strum::{IntoStaticStr, VariantArray};
@@ -24,20 +24,6 @@ pub enum Decay {
     Linear,
     /// A constant factor per iteration, chosen so that the rate reaches its end value with the end of the run.
     Exponential,
-}
-
-/// Form of the Gaussians of the preset `fast`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
-#[serde(rename_all = "kebab-case")]
-#[strum(serialize_all = "kebab-case")]
-pub enum GaussianForm {
-    /// A separate set of Gaussians per phase; the sets share nothing.
-    Phase,
-    /// One set of Gaussians that moves over the beat.
-    #[serde(alias = "tree")]
-    Deformable,
-    /// `Deformable` where the data allow it, otherwise `Phase`.
-    Auto,
 }
 
 /// Images of a moving object to which a static method is fitted.

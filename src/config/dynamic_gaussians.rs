@@ -1,7 +1,7 @@
 //! Settings of Gaussians in front of a static tensor field: the preset `fast`.
 
 use crate::calibrate::settings::CalibrateMode;
-use crate::config::choices::{AdjustMode, Decay, DynamicTarget, GaussianForm, OcclusionRegion};
+use crate::config::choices::{AdjustMode, Decay, DynamicTarget, OcclusionRegion};
 use crate::config::common::{Calibrate, Render, Train};
 use crate::config::fields::{
     Adam, DynamicField, FieldSettings, Loss, March, Occupancy, StaticField, Tensor, check_batches,
@@ -10,6 +10,8 @@ use crate::config::method::MethodSettings;
 use crate::config::section::{section, sections};
 use crate::config::{Config, Preset, Shared};
 use crate::error::Result;
+use serde::{Deserialize, Serialize};
+use strum::{IntoStaticStr, VariantArray};
 
 /// Decay of Adam's first and second moments for the static field: the betas of NerT-CA's authors, whose static field it is.
 const BETAS: [f64; 2] = [0.9, 0.99];
@@ -19,6 +21,52 @@ const EPSILON: f64 = 1e-8;
 fn one_fit() -> u32 {
     1
 }
+
+/// Form of the Gaussians of the preset `fast`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
+pub enum GaussianForm {
+    /// A separate set of Gaussians per phase; the sets share nothing.
+    Phase,
+    /// One set of Gaussians that moves over the beat.
+    #[serde(alias = "tree")]
+    Deformable,
+    /// `Deformable` where the data allow it, otherwise `Phase`.
+    Auto,
+}
+
+/// A special case of a fit of Gaussians, which a study can leave out to measure what it earns (`studies/rules.toml`).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
+pub enum Rule {
+    /// Adjusted views are taken only where they leave much less of the images than calibrated ones.
+    Acceptance,
+    /// Broad Gaussians that not all views show are dropped.
+    BroadParts,
+    /// Gaussians far fainter than the vessels are dropped.
+    FaintGaussians,
+    /// Gaussians have a filling at each phase where contrast comes or goes.
+    Fillings,
+    /// The mean of several fits is taken where blades hide much of few views.
+    FitsBehindBlades,
+    /// The mean of several fits is taken where images are noisy.
+    FitsInNoise,
+    /// Broad Gaussians that are alone are dropped.
+    IsolatedGaussians,
+    /// Places that two views see are seeded by a regression on what both show, instead of by evidence alone.
+    LikelihoodOfTwoViews,
+    /// Short components that the images do not support are dropped.
+    ShortParts,
+    /// Motion is stiff with two views, and with three noisy ones.
+    StiffMotion,
+    /// The motion of vessels that contrast does not show is that of other phases.
+    UnseenPhases,
+}
+
+/// Rules that are left out.
+pub type LeftOut = Vec<Rule>;
 
 section! {
     /// Adjustment of the calibrated views.
@@ -66,6 +114,8 @@ section! {
         #[serde(default = "one_fit")] fits: u32 in 0.0 to 9.0,
         /// Leave out a catheter: Gaussians of a deformable set whose motion ends along a line.
         #[serde(default)] without_catheter: bool,
+        /// Rules that are left out, for studies of what each earns, e.g. `["fillings"]`.
+        #[serde(default)] without_rules: LeftOut,
     } fixed {
         /// Iteration at which weak Gaussians are pruned and new ones are seeded where line integrals are missing; 0 = never.
         grow_at: u32 in 0.0 to 1e6,
@@ -147,6 +197,7 @@ pub(super) fn fast() -> Config<GaussiansSettings> {
                 count: 500,
                 fits: 0,
                 without_catheter: false,
+                without_rules: Vec::new(),
                 grow_at: 50,
                 clear_at: 65,
                 background_every: 40,

@@ -2,7 +2,7 @@
 
 use crate::calibrate::settings::CalibrateMode;
 use crate::choice::Choice;
-use crate::config::sections::{GaussiansSettings, NertCaSettings, R2Settings, XSettings};
+use crate::config::sections::{GaussiansSettings, NertCaSettings, R2Settings, Rule, XSettings};
 use crate::config::{AdjustMode, Config, GaussianForm, Preset};
 use crate::error::Result;
 use std::collections::BTreeSet;
@@ -303,4 +303,15 @@ fn earlier_names_are_read_in_whole_configurations() {
         section.insert(before.to_owned(), value);
     }
     assert_eq!(table.try_into::<Config>().unwrap().of::<R2Settings>().unwrap().r2.count, 50_000);
+}
+
+#[test]
+fn rules_are_left_out_by_name() {
+    let fast = load(Preset::Fast, "gaussians.without_rules=[\"fillings\", \"stiff-motion\"]").unwrap();
+    let left_out = fast.of::<GaussiansSettings>().unwrap().gaussians.without_rules.clone();
+    assert_eq!(left_out, [Rule::Fillings, Rule::StiffMotion]);
+    let message = refusal(Preset::Fast, "gaussians.without_rules=[\"luck\"]");
+    assert!(message.contains("luck") && message.contains("fits-in-noise"), "{message}");
+    let message = refusal(Preset::Fast, "gaussians.without_rules=fillings");
+    assert!(message.contains("expected array"), "{message}");
 }

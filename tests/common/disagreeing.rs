@@ -2,17 +2,15 @@
 
 use glam::DVec3;
 use nertca_vk::calibrate::gauge::{FrameRays, RigidMotion, common_motion};
-use nertca_vk::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays, lps_mm_from_world, world_from_lps_mm};
+use nertca_vk::geometry::{CArm, Geometry, ViewRays, lps_mm_from_world, world_from_lps_mm};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::random::{STREAM_PHOTON, normal, uniform01};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use nertca_vk::scan::gating::contraction;
-use nertca_vk::scan::truth::{TrueFrame, Truth};
 use nertca_vk_phantom::projector::{LoadedVolume, Projector};
 use nertca_vk_phantom::tree::{Bounds, Heart, Tree};
 use nertca_vk_phantom::views::{CArmOptions, PixelPitch, ViewAngles};
 use nertca_vk_phantom::voxels::{self, Breath, Tissues};
-use std::path::Path;
 
 pub const PHASES: u32 = 10;
 const SCALE: f64 = 0.37;
@@ -71,11 +69,10 @@ impl Studio {
         Studio { heart: hearts, vessels, still, trees, projector, size }
     }
 
-    /// Projects the published training views, and unseen ones on request, with errors that the stated geometry does not
-    /// contain.
-    pub fn shoot(&self, n_views: u32, unseen: bool, wrong: Wrong) -> Shot {
+    /// Projects the published training views, with errors that the stated geometry does not contain.
+    pub fn shoot(&self, n_views: u32, wrong: Wrong) -> Shot {
         let mut views = ViewAngles::published(n_views).unwrap();
-        views.validation.truncate(if unseen { 2 } else { 0 });
+        views.validation.clear();
         let c_arms = CArmOptions {
             sod_mm: vec![450.0],
             sid_mm: vec![2500.0],
@@ -93,8 +90,7 @@ impl Studio {
             points: self.points(),
         };
         for (v, (c_arm, split)) in stated.iter().zip(&splits).enumerate() {
-            let seen = *split == Split::Train;
-            let error = |k: u32, size: f64| if seen { size * draw(v, k) } else { 0.0 };
+            let error = |k: u32, size: f64| size * draw(v, k);
             let mut truth = c_arm.clone();
             truth.primary_deg += error(0, wrong.angle_deg);
             truth.secondary_deg += error(1, wrong.angle_deg);
@@ -107,8 +103,7 @@ impl Studio {
             for t in 0..PHASES {
                 // A quarter of a breath per beat.
                 let course = (std::f64::consts::TAU * (start + 0.25 * f64::from(t) / f64::from(PHASES))).sin();
-                let amplitude = if seen { wrong.breathing_mm } else { 0.0 };
-                let lps = course * amplitude * DVec3::new(0.0, 0.3, 1.0);
+                let lps = course * wrong.breathing_mm * DVec3::new(0.0, 0.3, 1.0);
                 let moving = [&self.heart[t as usize], &self.vessels[t as usize]];
                 let moving = moving.map(|m| self.projector.project(m, &rays, lps).unwrap().swap_remove(0));
                 let mut integrals: Vec<f32> = still.clone();
@@ -118,7 +113,6 @@ impl Studio {
                     let noise = normal(wrong.seed, STREAM_PHOTON, 3000 + (v as u32) * 100 + t, p as u32);
                     *value += strongest * (wrong.noise * noise) as f32;
                 }
-                let mask = (!seen).then(|| moving[1].iter().map(|m| *m > 0.05 * strongest).collect());
                 let name = format!("view{v}-phase{t:02}");
                 shot.dataset.frames.push(Frame {
                     name,
@@ -126,7 +120,7 @@ impl Studio {
                     phase: t,
                     split: *split,
                     integrals: integrals.into(),
-                    mask,
+                    mask: None,
                     after_phase: 0.0,
                     heart_shift_mm: [0.0; 3],
                     contrast: 1.0,
@@ -175,29 +169,6 @@ impl Shot {
     /// Points of the vessels at a phase, patient mm (LPS).
     pub fn points_mm(&self, phase: usize) -> Vec<[f64; 3]> {
         self.points[phase].iter().map(|point| lps_mm_from_world(*point).to_array()).collect()
-    }
-
-    /// Writes `truth.json` into a directory.
-    pub fn write_truth(&self, directory: &Path) {
-        let frame = |f: &Frame| TrueFrame {
-            image: format!("{}.npy", f.name).into(),
-            view: f.view,
-            split: f.split,
-            phase: f.phase,
-            geometry: match &self.truth[f.view] {
-                Geometry::CArm(c_arm) => c_arm.clone(),
-                Geometry::Matrix(_) => panic!("a C-arm took these images"),
-            },
-            heart_shift_mm: (self.heart[f.view][f.phase as usize] * MM_PER_UNIT).to_array(),
-            beat_phase: f.phase.into(),
-            time_s: 0.0,
-            contrast_gain: 1.0,
-            filled_to: 1.0,
-            cut_share: 0.0,
-        };
-        let mut truth = Truth::new(0, PHASES);
-        truth.frames = self.dataset.frames.iter().map(frame).collect();
-        truth.write(directory).unwrap();
     }
 
     /// Rays of the training frames by their true geometry and by `corrected`, which maps (view, phase).

@@ -58,7 +58,7 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("march_loss", sum_for_product, an_iteration),
         fault("gradient_static", wrong_sign, an_iteration),
         fault("gradient_static", missing_clear, an_iteration),
-        fault("mlp_latent_bwd", sum_for_product, an_iteration),
+        fault("mlp_latent_bwd", difference_for_sum, an_iteration),
         fault("adam", wrong_sign, an_iteration),
         fault("march_fwd_samples", difference_for_sum, two_networks),
         fault("loss_samples", wrong_sign, two_networks),

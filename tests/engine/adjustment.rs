@@ -93,7 +93,7 @@ fn norm(values: impl Iterator<Item = f64>) -> f64 {
 #[test]
 fn columns_are_derivatives_of_the_twin() {
     let gpu = gpu();
-    let dataset = Studio::new(&gpu, SIZE, 1).shoot(3, false, Wrong::default()).dataset;
+    let dataset = Studio::new(&gpu, SIZE, 1).shoot(3, Wrong::default()).dataset;
     let trainer = fitted(&gpu, &dataset);
     let stands = Stands::new(&dataset, vec![0, 1, 2]);
     let field = FieldInLoop::new(&trainer, &stands);
@@ -127,7 +127,7 @@ fn columns_are_derivatives_of_the_twin() {
 #[test]
 fn planted_errors_of_poses_and_contrasts_are_found() {
     let gpu = gpu();
-    let dataset = Studio::new(&gpu, SIZE, 1).shoot(3, false, Wrong::default()).dataset;
+    let dataset = Studio::new(&gpu, SIZE, 1).shoot(3, Wrong::default()).dataset;
     let trainer = fitted(&gpu, &dataset);
     let stands = Stands::new(&dataset, vec![0, 1, 2]);
     let mut field = FieldInLoop::new(&trainer, &stands);
@@ -213,24 +213,9 @@ fn expect_taken_over(gpu: &Gpu, dataset: &Dataset, made: &MadeFit) {
 }
 
 #[test]
-#[ignore = "long: tools/test --all"]
-fn an_adjustment_brings_views_together() {
-    let gpu = gpu();
-    let wrong = Wrong { angle_deg: 0.2, shift_mm: 0.3, breathing_mm: 0.6, noise: 0.02, seed: 11 };
-    let shot = Studio::new(&gpu, 100, 1).shoot(3, false, wrong);
-    let (after, made) = adjust(&gpu, &shot, &Calibration::none(None));
-    let record = after.adjustment.clone().unwrap();
-    let corrected = shot.dataset.corrected(&after).unwrap();
-    expect_taken_over(&gpu, &corrected, &made);
-    let (before, after) = (error_px(&shot, &shot.dataset), error_px(&shot, &corrected));
-    println!("{before:.3} px to {after:.3} px, {record:?}");
-    assert!(record.accepted && before > 0.5 && after < 0.5 * before, "{before} px to {after} px, {record:?}");
-}
-
-#[test]
 fn views_that_agree_are_not_adjusted() {
     let gpu = gpu();
-    let shot = Studio::new(&gpu, 100, 1).shoot(4, false, Wrong { seed: 11, ..Wrong::default() });
+    let shot = Studio::new(&gpu, 100, 1).shoot(4, Wrong { seed: 11, ..Wrong::default() });
     let calibration = calibrate(&shot.dataset, fast().into_any().calibration()).unwrap();
     let (after, made) = adjust(&gpu, &shot, &calibration);
     let record = after.adjustment.clone().unwrap();
@@ -272,7 +257,7 @@ fn session_with(gpu: &Gpu, shot: &Shot, config: Config) -> Session {
 fn a_session_adjusts_its_views_when_training_has_ended_and_trains_on() {
     let gpu = gpu();
     let wrong = Wrong { angle_deg: 0.2, shift_mm: 0.3, breathing_mm: 0.6, noise: 0.02, seed: 11 };
-    let mut shot = Studio::new(&gpu, 100, 1).shoot(3, false, wrong);
+    let mut shot = Studio::new(&gpu, 100, 1).shoot(3, wrong);
     // Contrasts that differ from frame to frame: calibration does not know them.
     for frame in &mut shot.dataset.frames {
         let contrast = if (frame.phase as usize + frame.view).is_multiple_of(2) { 1.15 } else { 0.85 };
@@ -312,7 +297,7 @@ fn a_session_adjusts_its_views_when_training_has_ended_and_trains_on() {
 #[test]
 fn a_session_that_is_stopped_while_it_adjusts_keeps_its_reconstruction() {
     let gpu = gpu();
-    let shot = Studio::new(&gpu, SIZE, 1).shoot(3, false, Wrong { seed: 11, ..Wrong::default() });
+    let shot = Studio::new(&gpu, SIZE, 1).shoot(3, Wrong { seed: 11, ..Wrong::default() });
     let session = Arc::new(session(&gpu, &shot));
     let end = fast().train.iterations;
     let reached = Arc::new((Mutex::new(false), Condvar::new()));
@@ -349,7 +334,7 @@ fn short() -> Config {
 }
 
 fn of_two_views(gpu: &Gpu) -> Shot {
-    let mut shot = Studio::new(gpu, SIZE, 1).shoot(3, false, Wrong { seed: 11, ..Wrong::default() });
+    let mut shot = Studio::new(gpu, SIZE, 1).shoot(3, Wrong { seed: 11, ..Wrong::default() });
     shot.dataset.frames.retain(|frame| frame.view < 2);
     shot.dataset.views.truncate(2);
     shot

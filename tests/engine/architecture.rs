@@ -261,7 +261,7 @@ const METHODS: [Named; 6] = [
             "Deformable*",
             "deformable*",
         ],
-        limit: 7,
+        limit: 6,
     },
     Named { room: "r2_gaussian", words: &["r2_gaussian", "R2*", "r2", "r2_*"], limit: 5 },
     Named {

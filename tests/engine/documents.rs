@@ -1,6 +1,8 @@
 //! Documents say what is: the pages of figures stay short, no document tells history, and links lead somewhere.
 
 use crate::root::root;
+use nertca_vk::choice::Choice;
+use nertca_vk::config::sections::Rule;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
@@ -85,4 +87,23 @@ fn links_lead_somewhere() {
     }
     assert!(links > 100 && broken.is_empty(), "{links} links, broken:\n{}", broken.join("\n"));
     assert!(anchors("## Scores in 3D, `x`").contains("scores-in-3d-x"));
+}
+
+/// A rule that no study leaves out is a rule without evidence.
+#[test]
+fn each_rule_can_be_left_out_and_a_study_does_so() {
+    let study = std::fs::read_to_string(root().join("studies/rules.toml")).unwrap();
+    let room = root().join("src/methods/dynamic_gaussians");
+    let sources: String = room
+        .read_dir()
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.is_file())
+        .map(|path| std::fs::read_to_string(path).unwrap())
+        .collect();
+    for rule in Rule::ALL {
+        let method = format!("set = ['gaussians.without_rules=[\"{}\"]']", rule.name());
+        assert!(study.contains(&method), "studies/rules.toml has no method with {method}");
+        assert!(sources.contains(&format!("applies(Rule::{rule:?})")), "nothing asks whether {rule:?} applies");
+    }
 }

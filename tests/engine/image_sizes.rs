@@ -7,7 +7,7 @@ use nertca_vk::gpu::device::Gpu;
 use nertca_vk::model::Model;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::scan::dataset::{Dataset, Layout, Split};
+use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split};
 use nertca_vk::scan::writer::convert;
 use nertca_vk::train::trainer::Trainer;
 use nertca_vk_vessels::score::eval::{Evaluation, evaluate};
@@ -90,9 +90,14 @@ fn trained(gpu: &Gpu, dataset: &Dataset) -> Model {
     trainer.model().unwrap()
 }
 
+/// Unseen images of every fifth phase, which tell as much as all.
+fn unseen(dataset: &Dataset) -> Vec<&Frame> {
+    dataset.validation().iter().filter(|frame| frame.phase % 5 == 0).collect()
+}
+
 fn scored(gpu: &Gpu, model: &Model, dataset: &Dataset) -> Evaluation {
     let renderer = Renderer::new(gpu, model, tuning(gpu)).unwrap();
-    let frames: Vec<_> = dataset.validation().iter().collect();
+    let frames = unseen(dataset);
     evaluate(&renderer, dataset, &frames, model.step, None, |_| Ok(())).unwrap()
 }
 
@@ -169,16 +174,16 @@ fn a_reconstruction_of_cropped_views_is_as_good_and_scored_on_what_they_show() {
     // With one model, uncropped images have equal scores, and cropped ones the scores computed by hand.
     let (a, b) = (scored(&gpu, &of_full, &full), scored(&gpu, &of_full, &cut));
     let renderer = Renderer::new(&gpu, &of_full, tuning(&gpu)).unwrap();
-    let unseen = &CROPPED[1];
-    for ((frame, a), b) in full.validation().iter().zip(&a.images).zip(&b.images) {
-        if frame.view != view(&full, unseen.view) {
+    let window = &CROPPED[1];
+    for ((frame, a), b) in unseen(&full).into_iter().zip(&a.images).zip(&b.images) {
+        if frame.view != view(&full, window.view) {
             assert_eq!((a.dice_dynamic, a.psnr, a.ssim), (b.dice_dynamic, b.psnr, b.ssim), "{}", a.name);
             continue;
         }
         let seen = renderer.render_taken(&full.heart_rays(frame), SIZE, SIZE, frame.beat_time()).unwrap();
-        let rows = unseen.first[1]..unseen.first[1] + unseen.size[1];
+        let rows = window.first[1]..window.first[1] + window.size[1];
         let kept: Vec<usize> =
-            rows.flat_map(|y| (0..unseen.size[0]).map(move |x| y * SIZE + unseen.first[0] + x)).collect();
+            rows.flat_map(|y| (0..window.size[0]).map(move |x| y * SIZE + window.first[0] + x)).collect();
         let total = seen.total_integral();
         let [low, high] =
             kept.iter().map(|p| frame.integrals[*p]).fold([f32::MAX, f32::MIN], |[l, h], v| [l.min(v), h.max(v)]);
@@ -226,7 +231,7 @@ fn large_images_are_fitted_from_coarse_to_fine() {
     run(&mut trainer, config.gaussian_iterations());
     let fine = pixel_of(&trainer);
     assert!((coarse / fine - 2.0).abs() < 1e-6, "{coarse} and {fine}");
-    let frames: Vec<_> = dataset.validation().iter().filter(|frame| frame.phase % 5 == 0).collect();
+    let frames = unseen(&dataset);
     let renderer = Renderer::new(&gpu, &trainer.model().unwrap(), tuning(&gpu)).unwrap();
     let dice = evaluate(&renderer, &dataset, &frames, 0, None, |_| Ok(())).unwrap().dice.dynamic.unwrap();
     println!("Dice {dice:.4}");

@@ -15,7 +15,7 @@ use std::sync::Arc;
 fn a_session_fits_as_a_run_with_the_same_prior() {
     const ITERATIONS: u32 = 10;
     let gpu = gpu();
-    let shot = Studio::new(&gpu, 64, 1).shoot(3, false, Wrong::default());
+    let shot = Studio::new(&gpu, 64, 1).shoot(3, Wrong::default());
     let prior = VesselPrior { shapes_mm: vec![shot.points_mm(0)] };
     let of_session = |prior: Option<VesselPrior>| -> GaussianField {
         let session = session(&gpu, &shot);

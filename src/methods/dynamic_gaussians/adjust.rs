@@ -9,7 +9,7 @@ use crate::calibrate::adjustment::{Adjusted, Adjustment};
 use crate::calibrate::observed::coarsened_for_calibration;
 use crate::calibrate::pose::{Poses, ViewPose};
 use crate::calibrate::settings::CalibrateMode;
-use crate::config::sections::GaussiansSettings;
+use crate::config::sections::{GaussiansSettings, Rule};
 use crate::config::{AdjustMode, GaussianForm};
 use crate::error::{Error, Result};
 use crate::evidence::ratios::ViewEvidence;
@@ -152,9 +152,14 @@ impl Adjuster<'_> {
         let Some(poses) = self.found(start, observe)? else { return Ok(None) };
         let nearly = f64::from(N_CYCLES + 1) / f64::from(N_CYCLES + 2);
         match self.compared(&self.as_in_a_run(&poses)?, &mut || observe(nearly))? {
-            Some((after, adjusted)) if after <= ACCEPTED * before => outcome(poses, true, Some(after), adjusted),
+            Some((after, adjusted)) if after <= self.accepted() * before => outcome(poses, true, Some(after), adjusted),
             after => outcome(poses, false, after.map(|(after, _)| after), made),
         }
+    }
+
+    /// Returns the largest share of the misfit that an accepted adjustment leaves.
+    fn accepted(&self) -> f64 {
+        if self.config.gaussians.applies(Rule::Acceptance) { ACCEPTED } else { 1.0 }
     }
 
     /// Finds poses in cycles of a fit and a step of the poses.

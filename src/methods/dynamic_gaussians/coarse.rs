@@ -67,6 +67,7 @@ impl Targets {
             width,
             height,
             views: self.views.iter().map(|view| view.coarser(scale)).collect(),
+            without: self.without.clone(),
             image_of: self.image_of.clone(),
             contrast: self.contrast.clone(),
             images: mean(&self.images),
@@ -129,6 +130,7 @@ mod tests {
             rest_phase: 1,
             contrast_comes_and_goes: false,
             views_adjusted: false,
+            without: Vec::new(),
             places: vec![
                 vec![PossibleVessel { position: DVec3::new(4.0, 6.0, -8.0), evidence: 9.0, far_from_prior: 0.0 }],
                 Vec::new(),

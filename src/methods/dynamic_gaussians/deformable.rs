@@ -1,6 +1,7 @@
 //! Fits a deformable set: Gaussians of one phase, carried through the beat by a grid, all of it together. [`crate::methods::dynamic_gaussians::start`] prepares
 //! it.
 
+use crate::config::sections::Rule;
 use crate::error::{Error, Result};
 use crate::evidence::series::blur;
 use crate::fitting::iterations::{Iterations, pass_times};
@@ -266,6 +267,9 @@ impl DeformableTrainer {
 
     /// Completes the motion of vessels that contrast does not show: at a phase that was tracked from those before it, or at all phases.
     fn complete_motion(&self, tracked: Option<&Track>) -> Result<()> {
+        if !self.targets.applies(Rule::UnseenPhases) {
+            return Ok(());
+        }
         let mut deformable = self.deformable()?;
         match tracked {
             Some(track) if is_well_seen(&deformable, track.phase as usize) => return Ok(()),
@@ -469,8 +473,14 @@ impl DeformableTrainer {
         let members = self.download()?;
         let (rows, setup) = (&members.particles.rows, &self.joint.setup);
         let components = components(rows, setup);
-        let broad = broad_parts(&components, rows, setup);
-        let short = if self.prunes { short_parts(&components, rows, self.targets.lengths.factor) } else { Vec::new() };
+        let mut broad = broad_parts(&components, rows, setup);
+        let mut short = short_parts(&components, rows, self.targets.lengths.factor);
+        if !self.targets.applies(Rule::BroadParts) {
+            broad.clear();
+        }
+        if !self.prunes || !self.targets.applies(Rule::ShortParts) {
+            short.clear();
+        }
         if broad.is_empty() && short.is_empty() {
             return Ok(());
         }

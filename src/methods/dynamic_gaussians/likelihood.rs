@@ -1,5 +1,6 @@
 //! Probability that a place of the hull holds vessel, by which the first places of Gaussians are drawn.
 
+use crate::config::sections::Rule;
 use crate::gaussians::view::SplatView;
 use crate::methods::dynamic_gaussians::targets::{PossibleVessel, Targets};
 use glam::DVec3;
@@ -29,7 +30,7 @@ pub(super) fn likelihoods(targets: &Targets, phase: usize) -> Vec<f64> {
     let views: Vec<(usize, &SplatView)> = targets.views_at(phase).collect();
     let of = |place: &PossibleVessel| {
         let log_odds = match views.len() {
-            2 => log_odds_of_two(targets, &views, place),
+            2 if targets.applies(Rule::LikelihoodOfTwoViews) => log_odds_of_two(targets, &views, place),
             n => log_odds(place.evidence, n),
         };
         sigmoid(log_odds - FAR_LOG_ODDS * place.far_from_prior)

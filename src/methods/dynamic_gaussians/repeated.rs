@@ -1,5 +1,6 @@
 //! Several fits to the same images, whose mean is the dynamic field: each fit to noisy or inconsistent images has errors of its own.
 
+use crate::config::sections::Rule;
 use crate::error::{Error, Result};
 use crate::gaussians::field::GaussianField;
 use crate::gpu::device::Gpu;
@@ -31,14 +32,19 @@ impl Targets {
                 FITS_TO_TWO_VIEWS,
                 Some("because two views leave alternatives, and places that few fits find are often false"),
             ),
-            0 if self.is_noisy() => (FITS, Some("because the images are noisy")),
-            0 if self.n_views <= FEW_VIEWS && self.hidden_share() >= HIDDEN => {
+            0 if self.is_noisy() && self.applies(Rule::FitsInNoise) => (FITS, Some("because the images are noisy")),
+            0 if self.blades_hide_much() && self.applies(Rule::FitsBehindBlades) => {
                 (FITS, Some("because blades hide much of the few views"))
             }
             0 if self.views_adjusted => (FITS, Some("because the views had to be adjusted")),
             0 | 1 => (1, None),
             n => (n, Some("as gaussians.fits says")),
         }
+    }
+
+    /// Tells whether blades hide so much of few views that parts of the vessels are seen by one view alone.
+    fn blades_hide_much(&self) -> bool {
+        self.n_views <= FEW_VIEWS && self.hidden_share() >= HIDDEN
     }
 
     /// Returns the share of the pixels of all images that blades hide.

@@ -7,7 +7,7 @@
 //!
 //! [`Lengths`]: crate::methods::dynamic_gaussians::lengths::Lengths
 
-use crate::config::sections::{GaussiansSettings, Train};
+use crate::config::sections::{GaussiansSettings, Rule, Train};
 use crate::config::{Config, GaussianForm};
 
 /// Adam's rate of log-scales.
@@ -82,6 +82,15 @@ pub struct GaussianRules {
     /// Interval, in iterations, at which the static background is estimated again from the images minus the Gaussians; not while
     /// rates fall; 0 = never.
     pub background_every: u32,
+    /// Rules that are left out.
+    pub without: Vec<Rule>,
+}
+
+impl GaussianRules {
+    /// Tells whether a rule applies.
+    pub fn applies(&self, rule: Rule) -> bool {
+        !self.without.contains(&rule)
+    }
 }
 
 /// Numbers of one set that moves.
@@ -131,6 +140,7 @@ impl Rules {
                 clear_at: gaussians.clear_at,
                 link: 4.0,
                 background_every: gaussians.background_every,
+                without: gaussians.without_rules.clone(),
             },
             deformable: DeformableRules {
                 warm_iterations: deformable.warm_iterations,

@@ -1,5 +1,6 @@
 //! Constants and schedule of a fit of Gaussians.
 
+use crate::config::sections::Rule;
 use crate::fitting::RING_LENGTH;
 use crate::gaussians::field::inverse_step;
 use crate::gaussians::stages::{FIXED_POINT_BITS, loss_parts};
@@ -104,12 +105,12 @@ pub fn grows(settings: &GaussianRules, step: u32) -> bool {
 
 /// Tells whether Gaussians too faint for vessels are dropped before an iteration.
 pub fn clears(settings: &GaussianRules, step: u32) -> bool {
-    settings.clear_at > 0 && step == settings.clear_at
+    settings.clear_at > 0 && step == settings.clear_at && settings.applies(Rule::FaintGaussians)
 }
 
 /// Tells whether Gaussians that stand for no vessel are dropped after an iteration.
 pub fn parts_from_strays(settings: &GaussianRules, step: u32) -> bool {
-    settings.link > 0.0 && step == settings.iterations
+    settings.link > 0.0 && step == settings.iterations && settings.applies(Rule::IsolatedGaussians)
 }
 
 /// Tells whether the static background is estimated anew before an iteration. It is not while rates fall, since the fit could

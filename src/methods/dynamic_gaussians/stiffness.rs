@@ -1,5 +1,6 @@
 //! Freedom of the motion of a deformable set, by the noise of the images and the number of views.
 
+use crate::config::sections::Rule;
 use crate::evidence::noise::NOISY;
 use crate::methods::dynamic_gaussians::rules::DeformableRules;
 use crate::methods::dynamic_gaussians::targets::Targets;
@@ -20,7 +21,8 @@ impl Targets {
 
     /// Tells whether the motion of a deformable set is limited to that of a smooth grid.
     pub fn needs_stiff_motion(&self) -> bool {
-        self.n_views <= TWO_VIEWS || self.n_views <= FEW_VIEWS && self.is_noisy()
+        let few = self.n_views <= TWO_VIEWS || self.n_views <= FEW_VIEWS && self.is_noisy();
+        few && self.applies(Rule::StiffMotion)
     }
 
     /// Returns the settings of a deformable set with lengths in pixels of the images and the freedom of motion that noise allows.

@@ -1,6 +1,7 @@
 //! Targets of Gaussians: views, bounds of the dynamic field's images, weights, and where vessels may be.
 
 use crate::config::GaussianForm;
+use crate::config::sections::Rule;
 use crate::error::{Error, Result};
 use crate::evidence::ratios::ViewEvidence;
 use crate::evidence::series::Series;
@@ -76,6 +77,8 @@ pub struct Targets {
     pub contrast_comes_and_goes: bool,
     /// Whether the geometry of the views was adjusted with the vessels in the loop.
     pub views_adjusted: bool,
+    /// Rules that are left out.
+    pub without: Vec<Rule>,
     /// Cells of the hull, per phase.
     pub places: Vec<Vec<PossibleVessel>>,
     /// Side of a cell, pixels at the isocentre.
@@ -154,6 +157,7 @@ impl Targets {
             rest_phase: 0,
             contrast_comes_and_goes: false,
             views_adjusted: dataset.views_adjusted,
+            without: settings.without.clone(),
             places: Vec::new(),
             cell: motion.hull.cell / units.pixel,
         };
@@ -191,7 +195,7 @@ impl Targets {
         let noise = motion.views.iter().flat_map(|v| v.background.noise.values.iter().map(|s| share(*s)));
         targets.noise = SharedImages::new(noise.collect(), slots, dataset.n_pixels());
         targets.rest_phase = targets.phase_that_shows_most();
-        targets.contrast_comes_and_goes = targets.some_phase_lacks_contrast();
+        targets.contrast_comes_and_goes = targets.applies(Rule::Fillings) && targets.some_phase_lacks_contrast();
         let own = |view: usize, change: &Image| {
             let [width, height] = dataset.views[view].size;
             Image { width, height, values: dataset.own(view, &change.values).into_owned() }
@@ -209,6 +213,11 @@ impl Targets {
         };
         targets.places = motion.hull.cells.iter().map(|cells| cells.iter().map(place).collect()).collect();
         Ok(targets)
+    }
+
+    /// Tells whether a rule applies.
+    pub fn applies(&self, rule: Rule) -> bool {
+        !self.without.contains(&rule)
     }
 
     /// Returns the form of the dynamic field that suits the data where `asked` leaves it open. A deformable set shares one set of

@@ -49,6 +49,7 @@ pub fn targets(images: &[f32], n_views: usize) -> Targets {
         rest_phase: 0,
         contrast_comes_and_goes: false,
         views_adjusted: false,
+        without: Vec::new(),
         places: vec![Vec::new(); PHASES],
         cell: 1.0,
     }

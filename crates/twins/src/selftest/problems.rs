@@ -144,6 +144,7 @@ pub fn targets(width: usize, height: usize, n_phases: usize) -> Result<Targets> 
         max: Some(all.clone().map(|i| 1.0 + wave(i, 0.37)).collect()),
         contrast_comes_and_goes: false,
         views_adjusted: false,
+        without: Vec::new(),
         places: vec![Vec::new(); n_phases],
         cell: 1.0,
     })
