@@ -30,7 +30,7 @@ fn text(path: &Path) -> &str {
 }
 
 fn phantom(data: &Path, imperfection: &[&str]) {
-    let plain = ["phantom", text(data), "--size", "80", "--phases", "8", "--no-volumes"];
+    let plain = ["phantom", text(data), "--size", "80", "--phases", "8", "--no-volumes", "--test-angles=-5,40;90,0"];
     nertca(&[&plain, imperfection].concat());
 }
 
@@ -75,9 +75,10 @@ fn a_haze_behind_blades_is_no_vessel() {
     let directory = tempfile::tempdir().unwrap();
     let [data, run] = ["data", "run"].map(|name| directory.path().join(name));
     let real = ["--tree", text(&tree), "--background", text(&ct), "--views", "3", "--seed", "4", "--no-volumes"];
+    let unseen = ["--test-angles=-5,40;90,0"];
     let moderate = ["--geometry-error", "0.5,2", "--breathing", "3", "--photons", "1e5", "--contrast-variation", "20"];
     let frames = ["--heart-rate", "70,80,65", "--fps", "15", "--collimate", "0.1"];
-    nertca(&[&["phantom", text(&data)], &real[..], &moderate, &frames].concat());
+    nertca(&[&["phantom", text(&data)], &real[..], &unseen, &moderate, &frames].concat());
     let trained =
         program().args(["train", text(&data), "-o", text(&run), "--seed", "4", "--stop-at", "130"]).output().unwrap();
     let told = String::from_utf8_lossy(&trained.stderr);

@@ -548,7 +548,7 @@ fn scoring_stops_when_told_and_can_be_left_for_later() {
     ok(&["phantom", text(&data), "--size", "64", "--phases", "10", "--views", "3", "--no-volumes"]);
     let run = directory.path().join("run");
     // Forty images that take long to render.
-    let slow = [SHORT, &["--set", "train.validate_every=0", "--set", "march.render_samples=2048"]].concat();
+    let slow = [SHORT, &["--set", "train.validate_every=0", "--set", "march.render_samples=1024"]].concat();
     for name in ["-TERM", "-INT"] {
         let (mut child, mut lines) = training(&data, &run, &[&slow[..], &["--force"]].concat());
         assert!(lines.any(|line| line["event"] == "evaluation" && line["images"] == 1), "no image was scored");

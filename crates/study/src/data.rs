@@ -11,7 +11,7 @@ use nertca_vk_phantom::dataset::{Anatomy, PhantomOptions, Setting, make};
 use nertca_vk_phantom::degradations::{Breathing, Degradations, GeometryError, Rhythm};
 use nertca_vk_phantom::noise::Photons;
 use nertca_vk_phantom::stenosis::Stenosis;
-use nertca_vk_phantom::views::{CArmOptions, PixelPitch, ViewAngles};
+use nertca_vk_phantom::views::{Angles, CArmOptions, PixelPitch, ViewAngles};
 use serde::{Deserialize, Serialize};
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
@@ -43,6 +43,12 @@ pub struct PhantomSection {
     phases: Option<u32>,
     /// Numbers of training views; each gives a data set of its own.
     views: Option<Vec<u32>>,
+    /// Primary and secondary angle of each training view, degrees, instead of a number of published views.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    angles: Option<Vec<[f64; 2]>>,
+    /// Angles of the unseen views, degrees; without them, those of the paper.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    test_angles: Option<Vec<[f64; 2]>>,
     /// Seed of shape and noise for all runs; without it, each run uses its own seed.
     seed: Option<u32>,
     /// File with a tree of real anatomy.
@@ -81,7 +87,9 @@ impl PhantomSection {
             geometry: self.geometry.or(common.geometry),
             size: self.size.or(common.size),
             phases: self.phases.or(common.phases),
-            views: self.views.or(common.views),
+            views: if self.angles.is_some() { self.views.clone() } else { self.views.clone().or(common.views) },
+            angles: if self.views.is_some() { self.angles } else { self.angles.or(common.angles) },
+            test_angles: self.test_angles.or(common.test_angles),
             seed: self.seed.or(common.seed),
             tree: self.tree.or(common.tree),
             background: self.background.or(common.background),
@@ -99,6 +107,35 @@ impl PhantomSection {
             collimated_share: self.collimated_share.or(common.collimated_share),
             stenoses: self.stenoses.or(common.stenoses),
         }
+    }
+
+    /// Returns the numbers of training views, each of which gives a data set.
+    fn numbers_of_views(&self) -> std::result::Result<Vec<u32>, String> {
+        match (&self.views, &self.angles) {
+            (Some(_), Some(_)) => Err("`views` and `angles` cannot be used together".into()),
+            (None, Some(angles)) => Ok(vec![angles.len() as u32]),
+            (Some(views), None) => Ok(views.clone()),
+            (None, None) => Ok(vec![USUAL_VIEWS]),
+        }
+    }
+
+    /// Returns the stated angles, or the published ones of a number of training views.
+    fn view_angles(&self, views: u32) -> Result<ViewAngles> {
+        let listed = |angles: &[[f64; 2]]| {
+            angles
+                .iter()
+                .map(|[primary_deg, secondary_deg]| Angles { primary_deg: *primary_deg, secondary_deg: *secondary_deg })
+                .collect::<Vec<_>>()
+        };
+        let unseen = self.test_angles.as_deref().map(listed);
+        let mut angles = match &self.angles {
+            Some(training) => ViewAngles::given(&listed(training), unseen.as_deref())?,
+            None => ViewAngles::published(views)?,
+        };
+        if let Some(unseen) = unseen {
+            angles.validation = unseen;
+        }
+        Ok(angles)
     }
 
     fn degradations(&self) -> std::result::Result<Degradations, String> {
@@ -245,7 +282,7 @@ pub(super) fn phantoms(
     if section.volumes == Some(false) && section.volumes_every.is_some() {
         return Err("`volumes_every` and `volumes = false` contradict each other".into());
     }
-    let numbers = section.views.clone().unwrap_or_else(|| vec![USUAL_VIEWS]);
+    let numbers = section.numbers_of_views()?;
     if let Some(i) = (1..numbers.len()).find(|i| numbers[..*i].contains(&numbers[*i])) {
         return Err(format!("views: {} is given twice", numbers[i]));
     }
@@ -254,7 +291,7 @@ pub(super) fn phantoms(
         take_in(&mut files, file).map_err(|e| e.to_string())?;
     }
     let one = |views: u32| -> std::result::Result<DataSet, String> {
-        let angles = ViewAngles::published(views).map_err(|e| e.to_string())?;
+        let angles = section.view_angles(views).map_err(|e| e.to_string())?;
         degradations.check(angles.training.len(), Layout::Native).map_err(|e| e.to_string())?;
         let stated = PhantomSection { views: Some(vec![views]), ..section.clone() };
         let mut fingerprint = files;
@@ -367,5 +404,23 @@ mod tests {
         // The text of a section decides its fingerprint.
         assert!(!serde_json::to_string(&section("size = 64")).unwrap().contains("stenoses"));
         assert!(toml::from_str::<PhantomSection>("stenoses = [{ branch = \"LAD\" }]").is_err(), "fields are missing");
+    }
+
+    #[test]
+    fn angles_are_stated_instead_of_a_number_of_views() {
+        let section = |text: &str| toml::from_str::<PhantomSection>(text).unwrap();
+        let places = Places::new([]);
+        let stated = section("angles = [[-30, 0], [60, -10]]\ntest_angles = [[0, 0]]");
+        let sets = phantoms("two", "two", &stated.clone().over(&section("views = [3, 4]")), &places).unwrap();
+        let Source::Phantom(phantom) = &sets[0].source else { panic!("a phantom") };
+        let views = &phantom.options.views;
+        assert_eq!((sets.len(), sets[0].id.as_str(), sets[0].views), (1, "two-2v", Some(2)));
+        assert_eq!((views.training[1].primary_deg, views.training[1].secondary_deg), (60.0, -10.0));
+        assert_eq!(views.validation.len(), 1);
+        let of_four = section("views = [4]").over(&stated);
+        assert_eq!(phantoms("a", "a", &of_four, &places).unwrap()[0].views, Some(4), "views replace angles");
+        let both = section("views = [3]\nangles = [[0, 0], [90, 0]]");
+        assert!(phantoms("a", "a", &both, &places).unwrap_err().contains("cannot be used together"));
+        assert!(!serde_json::to_string(&section("size = 64")).unwrap().contains("angles"));
     }
 }

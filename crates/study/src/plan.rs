@@ -59,6 +59,14 @@ pub struct Run {
     pub seed: u32,
 }
 
+/// Line of a setting that was added when results had been recorded, and that changes nothing.
+const ADDED: &str = "without_rules = []\n";
+
+/// Leaves out what recorded results did not state, so that these keep their fingerprint.
+fn as_before(settings: &str) -> String {
+    settings.replace(ADDED, "")
+}
+
 /// Fingerprint of a run's data, configuration and program. A result is valid only for the same fingerprint.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunFingerprint {
@@ -118,7 +126,7 @@ impl Study {
     pub fn fingerprint(&self, run: &Run) -> Result<RunFingerprint> {
         Ok(RunFingerprint {
             data: self.data[run.data].fingerprint(run.seed),
-            configuration: Fingerprint::of(self.config(run).acting_toml()?.as_bytes()).hex(),
+            configuration: Fingerprint::of(as_before(&self.config(run).acting_toml()?).as_bytes()).hex(),
             commit: COMMIT.to_owned(),
         })
     }
