@@ -473,14 +473,10 @@ impl DeformableTrainer {
         let members = self.download()?;
         let (rows, setup) = (&members.particles.rows, &self.joint.setup);
         let components = components(rows, setup);
-        let mut broad = broad_parts(&components, rows, setup);
-        let mut short = short_parts(&components, rows, self.targets.lengths.factor);
-        if !self.targets.applies(Rule::BroadParts) {
-            broad.clear();
-        }
-        if !self.prunes || !self.targets.applies(Rule::ShortParts) {
-            short.clear();
-        }
+        let targets = &self.targets;
+        let broad = if targets.applies(Rule::BroadParts) { broad_parts(&components, rows, setup) } else { Vec::new() };
+        let prunes = self.prunes && targets.applies(Rule::ShortParts);
+        let short = if prunes { short_parts(&components, rows, targets.lengths.factor) } else { Vec::new() };
         if broad.is_empty() && short.is_empty() {
             return Ok(());
         }

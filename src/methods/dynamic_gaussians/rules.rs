@@ -1,7 +1,7 @@
 //! Numbers of a fit of Gaussians: settings of users, values that a fit of a kind changes, and constants.
 //!
 //! Lengths are in pixels at the isocentre for images whose smaller side has 100 pixels, until [`Lengths`] adapts them to the images at hand;
-//! line integrals are shares of the views' strongest change. All numbers were tuned on the default phantom; `docs/log` holds the
+//! line integrals are shares of the views' strongest change. All numbers were tuned on the default phantom; `docs/tried.md` holds the
 //! measurements of [`FAINT`], `link` and `smoothness`. Those of the other numbers were not kept, so a change of them needs measurements of
 //! its own.
 //!
