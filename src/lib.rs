@@ -32,7 +32,7 @@
 //! # let directory = tempfile::tempdir().unwrap();
 //! # let (data, out) = (directory.path().join("data"), directory.path());
 //! # let small = nertca_vk::scan::small::small_dataset(32, 32, 4)?;
-//! # nertca_vk::scan::writer::convert(&small, nertca_vk::scan::dataset::Layout::Native, &data, "small".into())?;
+//! # nertca_vk::scan::writer::convert(&small, nertca_vk::scan::dataset::Layout::Native, &data)?;
 //! let dataset = Dataset::open(&data)?;
 //! let config = Config::preset(Preset::Fast);
 //! # let config = Config::load(Some(Preset::Fast), None, &["train.iterations=20".into()])?;
