@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Writes four procedural coronary trees at the scale of a heart, two left and two right ones, that move over a beat.
+"""Writes six procedural coronary trees at the scale of a heart, three left and three right ones, that move over a beat.
 
     .cache/python/bin/python tools/heart-trees.py OUT
     nertca-vk phantom DATA --tree OUT/l1.json ...
@@ -18,7 +18,8 @@ BEAT_MS = 860.0
 STEP_MM = 0.5
 # From the base to the apex.
 LONG_AXIS = np.array([-0.62, 0.55, -0.56]) / np.linalg.norm([-0.62, 0.55, -0.56])
-TREES = {"l1": ("left", 1), "l2": ("left", 2), "r1": ("right", 3), "r2": ("right", 4)}
+# Numbers were chosen on trees 1 and 2 of each side. Trees 3 judge (`studies/rules.toml`), and no number is chosen on them.
+TREES = {"l1": ("left", 1), "l2": ("left", 2), "l3": ("left", 103), "r1": ("right", 3), "r2": ("right", 4), "r3": ("right", 104)}
 
 
 def axes():
