@@ -35,7 +35,7 @@ use strum::{IntoStaticStr, VariantArray};
 /// Sections of a configuration and the settings of each method: each hyper-parameter with its meaning and accepted range.
 pub mod sections {
     pub use crate::config::common::{Calibrate, Render, Train};
-    pub use crate::config::dynamic_gaussians::{Deformable, Gaussians, GaussiansSettings, Rule};
+    pub use crate::config::dynamic_gaussians::{Deformable, Gaussians, GaussiansSettings, LeftOut, Rule};
     pub use crate::config::fields::{Network, Networks, Tensor};
     pub use crate::config::nerf_ca::NerfCaSettings;
     pub use crate::config::nert_ca::{NertCaHull, NertCaSettings};

@@ -66,7 +66,16 @@ pub enum Rule {
 }
 
 /// Rules that are left out.
-pub type LeftOut = Vec<Rule>;
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct LeftOut(pub Vec<Rule>);
+
+impl LeftOut {
+    /// Tells whether a rule applies.
+    pub fn keeps(&self, rule: Rule) -> bool {
+        !self.0.contains(&rule)
+    }
+}
 
 section! {
     /// Adjustment of the calibrated views.
@@ -197,7 +206,7 @@ pub(super) fn fast() -> Config<GaussiansSettings> {
                 count: 500,
                 fits: 0,
                 without_catheter: false,
-                without_rules: Vec::new(),
+                without_rules: LeftOut::default(),
                 grow_at: 50,
                 clear_at: 65,
                 background_every: 40,

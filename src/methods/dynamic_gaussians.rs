@@ -2,42 +2,22 @@
 //! to what moves in the images, then the static field to what they leave of the images.
 
 pub mod adjust;
-pub mod carried;
-pub mod catheter;
-pub mod coarse;
-mod conversions;
 pub mod data;
 pub mod deformable;
-pub mod filling;
-pub(crate) mod fine;
 pub mod fit;
 mod groups;
-pub mod lengths;
-mod likelihood;
-mod linked;
 pub mod made;
-mod mean;
-mod members;
 mod memory;
 pub mod per_phase;
-mod prior;
-mod pruning;
 pub mod remainder;
 mod repeated;
 pub mod rules;
 pub mod seeds;
 pub mod setup;
-pub mod shared_images;
 pub mod soft_hull;
-pub mod stages;
-pub mod start;
-mod stiffness;
 pub(crate) mod target_buffers;
 pub mod targets;
-#[cfg(test)]
-mod test_targets;
 pub mod trainer;
-mod unseen;
 
 use crate::config::sections::GaussiansSettings;
 use crate::config::{Config, GaussianForm, Method as Settings, OfMethod};
@@ -57,9 +37,9 @@ use crate::model::scene::Scene;
 use crate::scan::dataset::Dataset;
 use crate::tensors::File;
 use data::GaussianData;
+use deformable::stages::DeformableKernels;
 use fit::GaussianFit;
 use rules::Rules;
-use stages::DeformableKernels;
 use trainer::GaussiansFit;
 
 /// The method, for the registry.

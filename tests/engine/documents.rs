@@ -104,6 +104,6 @@ fn each_rule_can_be_left_out_and_a_study_does_so() {
     for rule in Rule::ALL {
         let method = format!("set = ['gaussians.without_rules=[\"{}\"]']", rule.name());
         assert!(study.contains(&method), "studies/rules.toml has no method with {method}");
-        assert!(sources.contains(&format!("applies(Rule::{rule:?})")), "nothing asks whether {rule:?} applies");
+        assert!(sources.contains(&format!("keeps(Rule::{rule:?})")), "nothing asks whether {rule:?} applies");
     }
 }

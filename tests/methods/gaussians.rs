@@ -14,9 +14,9 @@ use nertca_vk::methods::dynamic_gaussians::deformable::{DeformableTrainer, Earli
 use nertca_vk::methods::dynamic_gaussians::per_phase::GaussianTrainer;
 use nertca_vk::methods::dynamic_gaussians::rules::{GaussianRules, Rules};
 use nertca_vk::methods::dynamic_gaussians::setup;
-use nertca_vk::methods::dynamic_gaussians::shared_images::SharedImages;
 use nertca_vk::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use nertca_vk::methods::dynamic_gaussians::targets::Targets;
+use nertca_vk::methods::dynamic_gaussians::targets::shared_images::SharedImages;
 use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk_twins::reference::dynamic_gaussians::{DeformableParams, loss_and_gradient};
 use nertca_vk_twins::reference::gaussians::{self as reference, N_PARAMS, Params, params};

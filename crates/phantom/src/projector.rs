@@ -12,6 +12,9 @@ use crate::kernels::push;
 use crate::kernels::stages::{Build, Stage};
 use glam::DVec3;
 
+/// Side of a block of voxels that is skipped where all of it is zero, voxels; `BLOCK` of the shader.
+const BLOCK: usize = 8;
+
 /// Number of depth steps, of half a voxel each, for a projection through `volume` over `half_depth` (world units) on both
 /// sides.
 pub fn depth_steps(volume: &Volume, half_depth: f64) -> u32 {
@@ -29,6 +32,7 @@ pub struct Projector {
 /// A volume on the device.
 pub struct LoadedVolume {
     values: Buffer,
+    occupied: Buffer,
     volume: Volume,
 }
 
@@ -47,8 +51,9 @@ impl Projector {
     /// [`crate::error::Error::OutOfMemory`].
     pub fn load(&self, mut volume: Volume) -> Result<LoadedVolume> {
         let values = self.gpu.buffer_with("volume", &volume.values)?;
+        let occupied = self.gpu.buffer_with("occupied", &occupied_blocks(&volume))?;
         volume.values = Vec::new();
-        Ok(LoadedVolume { values, volume })
+        Ok(LoadedVolume { values, occupied, volume })
     }
 
     /// Line integrals (attenuation per mm times mm) of `volume`, displaced by `shift_mm` (LPS), for each view.
@@ -89,6 +94,7 @@ impl Projector {
             let bound = [
                 (Binding::views, (&views_buffer).into()),
                 (Binding::volume, (&loaded.values).into()),
+                (Binding::occupied, (&loaded.occupied).into()),
                 (Binding::integrals, (&integrals).into()),
             ];
             dispatch(&mut recording, &self.project, self.project.groups_over(pixels as u32), &bound, push)?;
@@ -97,6 +103,25 @@ impl Projector {
         let all: Vec<f32> = self.gpu.download(&integrals, 0, views.len() * pixels)?;
         Ok(all.chunks(pixels).map(<[f32]>::to_vec).collect())
     }
+}
+
+/// Returns 1 for each block of voxels where the block, or a voxel next to its upper faces, edges or corner, is not zero: a sample in any other
+/// block is zero. Blocks are ordered as voxels are.
+fn occupied_blocks(volume: &Volume) -> Vec<u32> {
+    let blocks = volume.size.map(|n| n.div_ceil(BLOCK));
+    let [columns, rows, _] = volume.size;
+    let mut occupied = vec![0; blocks.iter().product()];
+    for (row, values) in volume.values.chunks(columns.max(1)).enumerate() {
+        let (y, z) = (row % rows, row / rows);
+        for x in (0..values.len()).filter(|x| values[*x] != 0.0) {
+            // A voxel is also interpolated by samples of the voxels before it.
+            let of = |at: usize| at.saturating_sub(1) / BLOCK..=at / BLOCK;
+            for (bz, by) in of(z).flat_map(|bz| of(y).map(move |by| (bz, by))) {
+                of(x).for_each(|bx| occupied[(bz * blocks[1] + by) * blocks[0] + bx] = 1);
+            }
+        }
+    }
+    occupied
 }
 
 /// Largest distance of a volume's corner from the isocentre, world units.

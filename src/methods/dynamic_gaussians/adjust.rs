@@ -159,7 +159,7 @@ impl Adjuster<'_> {
 
     /// Returns the largest share of the misfit that an accepted adjustment leaves.
     fn accepted(&self) -> f64 {
-        if self.config.gaussians.applies(Rule::Acceptance) { ACCEPTED } else { 1.0 }
+        if self.config.gaussians.left_out.keeps(Rule::Acceptance) { ACCEPTED } else { 1.0 }
     }
 
     /// Finds poses in cycles of a fit and a step of the poses.

@@ -1,5 +1,7 @@
 //! Data of a fit: targets of the Gaussians, and the images of the static field behind them.
 
+pub(in crate::methods::dynamic_gaussians) mod prior;
+
 use crate::config::sections::GaussiansSettings;
 use crate::config::{Config, GaussianForm};
 use crate::error::{Error, Result};
@@ -8,7 +10,6 @@ use crate::fields::motion;
 use crate::fields::scale::dynamic_half;
 use crate::fitting::extent::between_phases;
 use crate::geometry::ViewRays;
-use crate::methods::dynamic_gaussians::prior;
 use crate::methods::dynamic_gaussians::rules::Rules;
 use crate::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
 use crate::methods::dynamic_gaussians::targets::Targets;

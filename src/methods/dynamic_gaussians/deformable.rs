@@ -1,12 +1,23 @@
-//! Fits a deformable set: Gaussians of one phase, carried through the beat by a grid, all of it together. [`crate::methods::dynamic_gaussians::start`] prepares
+//! Fits a deformable set: Gaussians of one phase, carried through the beat by a grid, all of it together. [`crate::methods::dynamic_gaussians::deformable::start`] prepares
 //! it.
+
+pub mod catheter;
+pub(in crate::methods::dynamic_gaussians) mod conversions;
+pub mod filling;
+pub(in crate::methods::dynamic_gaussians) mod linked;
+pub(in crate::methods::dynamic_gaussians) mod members;
+mod membership;
+pub(in crate::methods::dynamic_gaussians) mod pruning;
+pub mod stages;
+pub mod start;
+pub(in crate::methods::dynamic_gaussians) mod unseen;
 
 use crate::config::sections::Rule;
 use crate::error::{Error, Result};
 use crate::evidence::series::blur;
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::ring::{losses, ring};
-use crate::gaussians::field::{AGAINST_DIVERGENCE, Gaussians, MovingGaussians, dense};
+use crate::gaussians::field::{AGAINST_DIVERGENCE, Gaussians, MovingGaussians};
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers};
 use crate::gaussians::view::SplatView;
@@ -14,34 +25,29 @@ use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup, GaussianView, MotionGridSetup};
-use crate::methods::dynamic_gaussians::catheter::Catheter;
-use crate::methods::dynamic_gaussians::filling::{Filling, FillingBuffers, from_set_of_phase};
-use crate::methods::dynamic_gaussians::groups::vessels;
-use crate::methods::dynamic_gaussians::members::{MemberBuffers, Members};
-use crate::methods::dynamic_gaussians::per_phase::{MAX_PASSES, check_count, strong};
-use crate::methods::dynamic_gaussians::pruning::{Judge, broad_parts, components, short_parts};
-use crate::methods::dynamic_gaussians::rules::{DeformableRules, FAINT, Rules};
-use crate::methods::dynamic_gaussians::stages::{
+use crate::methods::dynamic_gaussians::deformable::catheter::Catheter;
+use crate::methods::dynamic_gaussians::deformable::filling::{Filling, FillingBuffers, from_set_of_phase};
+use crate::methods::dynamic_gaussians::deformable::members::{MemberBuffers, Members};
+use crate::methods::dynamic_gaussians::deformable::stages::{
     DeformableKernels, DeformablePass, GridBuffers, OwnMotion, OwnMotionBuffers, Track,
 };
-use crate::methods::dynamic_gaussians::stages::{
+use crate::methods::dynamic_gaussians::deformable::stages::{
     PhasePart, record_guess, record_images, record_step, record_step_in_parts, record_track,
 };
+use crate::methods::dynamic_gaussians::deformable::unseen::{complete, complete_phase, is_well_seen};
+use crate::methods::dynamic_gaussians::per_phase::{MAX_PASSES, check_count};
+use crate::methods::dynamic_gaussians::rules::{DeformableRules, Rules};
 use crate::methods::dynamic_gaussians::target_buffers::{
     Renewal, TargetPart, divided_targets, n_loss_parts, padded, renew_bounds, take_images,
 };
 use crate::methods::dynamic_gaussians::targets::Targets;
-use crate::methods::dynamic_gaussians::unseen::{complete, complete_phase, is_well_seen};
 use crate::methods::dynamic_gaussians::{seeds, setup};
 use crate::raster::Image;
-use glam::DVec3;
 
 /// Reach of the estimate of fillings at a phase before it is tracked, pixels of the settings.
 const GUESS_REACH: f64 = 3.0;
 /// Reach of the estimate of fillings at a phase that has been tracked, pixels of the settings.
 const TRACKED_REACH: f64 = 2.0;
-/// Minimum filling at the phases whose images decide where new Gaussians are placed.
-const MOSTLY_FILLED: f64 = 0.5;
 
 /// Earlier field with which a fit of a deformable set begins.
 #[derive(Clone, Copy)]
@@ -267,7 +273,7 @@ impl DeformableTrainer {
 
     /// Completes the motion of vessels that contrast does not show: at a phase that was tracked from those before it, or at all phases.
     fn complete_motion(&self, tracked: Option<&Track>) -> Result<()> {
-        if !self.targets.applies(Rule::UnseenPhases) {
+        if !self.targets.left_out.keeps(Rule::UnseenPhases) {
             return Ok(());
         }
         let mut deformable = self.deformable()?;
@@ -398,117 +404,6 @@ impl DeformableTrainer {
     fn renew_background(&mut self, renewal: Renewal) -> Result<()> {
         let images = self.images()?;
         renew_bounds(&self.gpu, &mut self.targets, &self.joint.parts, &self.joint.setup, &images, renewal)
-    }
-
-    /// Drops weak Gaussians and places new ones where data are missing at half the phases. This happens once in a run, on the
-    /// host, as with a set per phase.
-    fn grow(&mut self) -> Result<()> {
-        let (weakest, setup) = (self.config.gaussians.prune_threshold, self.joint.setup);
-        let mut members = self.retain(|rows| strong(rows, &setup, weakest))?;
-        let settings = self.targets.lengths.gaussians(&self.config.gaussians);
-        if seeds::n_additions(&settings) == 0 {
-            return Ok(());
-        }
-        let deformable = self.deformable()?;
-        let carried = |x: DVec3, phase: f64| deformable.carried(x, phase);
-        let is_filled = |x: DVec3, phase: usize| {
-            deformable.filling.is_none() || deformable.filling_at(deformable.nearest(x), phase) >= MOSTLY_FILLED
-        };
-        let images = self.images()?;
-        let additions =
-            seeds::deformable_additions(&self.targets, &settings, self.config.seed, &images, carried, is_filled);
-        members.append(additions, &deformable);
-        self.replace(&members)
-    }
-
-    /// Drops Gaussians that are too faint for vessels: they stand for other motion.
-    fn clear(&mut self) -> Result<()> {
-        let (faint, setup) = (FAINT, self.joint.setup);
-        self.retain(|rows| dense(rows, &setup, faint)).map(|_| ())
-    }
-
-    /// Drops Gaussians that are alone and broad.
-    fn drop_strays(&mut self) -> Result<()> {
-        let (link, setup) = (self.targets.lengths.gaussians(&self.config.gaussians).link, self.joint.setup);
-        self.retain(|rows| vessels(rows, &setup, link)).map(|_| ())
-    }
-
-    /// Looks for a catheter, and drops it where the settings say so.
-    fn find_catheter(&mut self) -> Result<()> {
-        self.catheter = Catheter::find(&self.deformable()?, self.targets.lengths.factor);
-        let dropped = self.catheter.as_ref().filter(|_| self.config.without_catheter);
-        if let Some(keep) = dropped.map(|catheter| catheter.members.iter().map(|member| !member).collect()) {
-            self.retain(|_| keep)?;
-        }
-        Ok(())
-    }
-
-    /// Returns sentences on a catheter that was found and on what was dropped, once.
-    pub(super) fn take_findings(&mut self) -> Vec<String> {
-        let n = std::mem::take(&mut self.n_broad);
-        let broad = (n > 0).then(|| {
-            format!(
-                "Gaussians that are left out, because they are broader than the vessels and hidden from some view, e.g. by a blade: {n}"
-            )
-        });
-        broad.into_iter().chain(self.take_catheter()).collect()
-    }
-
-    /// Returns a sentence on the catheter that was found, once.
-    fn take_catheter(&mut self) -> Option<String> {
-        let Catheter { extent_mm, slowest, .. } = self.catheter.take()?;
-        let found = format!(
-            "a catheter seems to be in the dynamic field: {extent_mm:.0} mm whose motion falls to {:.0} % of that of the vessels",
-            100.0 * slowest
-        );
-        Some(match self.config.without_catheter {
-            true => format!("{found}; it is left out (gaussians.without_catheter)"),
-            false => format!("{found}; --set gaussians.without_catheter=true leaves it out of field, tree and scores"),
-        })
-    }
-
-    /// Drops components that are no vessels: broad ones that not all views show, and, where the trainer prunes, short ones that the
-    /// images do not support.
-    fn drop_unsupported(&mut self) -> Result<()> {
-        let members = self.download()?;
-        let (rows, setup) = (&members.particles.rows, &self.joint.setup);
-        let components = components(rows, setup);
-        let targets = &self.targets;
-        let broad = if targets.applies(Rule::BroadParts) { broad_parts(&components, rows, setup) } else { Vec::new() };
-        let prunes = self.prunes && targets.applies(Rule::ShortParts);
-        let short = if prunes { short_parts(&components, rows, targets.lengths.factor) } else { Vec::new() };
-        if broad.is_empty() && short.is_empty() {
-            return Ok(());
-        }
-        let judge = Judge::new(&self.targets, &self.images()?);
-        let mut keep = vec![true; rows.len()];
-        for part in &broad {
-            if !judge.is_shown_by_all(&self.images_of_part(&members, part)?) {
-                part.iter().for_each(|i| keep[*i] = false);
-            }
-        }
-        let n_broad = keep.iter().filter(|keep| !**keep).count();
-        let left: Vec<&Vec<usize>> = short.into_iter().filter(|component| keep[component[0]]).collect();
-        for component in left {
-            if !judge.supports(&self.images_of_part(&members, component)?) {
-                component.iter().for_each(|i| keep[*i] = false);
-            }
-        }
-        // A set without Gaussians is no set: where the images support none, all stay.
-        if keep.contains(&true) && keep.contains(&false) {
-            self.retain(|_| keep)?;
-            self.n_broad = n_broad;
-        }
-        Ok(())
-    }
-
-    /// Images of some of the Gaussians, `[image][pixel]`, shares of the strongest change.
-    fn images_of_part(&self, members: &Members, part: &[usize]) -> Result<Vec<f32>> {
-        let mut keep = vec![false; members.particles.rows.len()];
-        part.iter().for_each(|i| keep[*i] = true);
-        let mut alone = members.clone();
-        alone.retain(&keep);
-        self.images_of(&alone.upload(&self.gpu, &self.joint.setup)?, part.len() as u32)
     }
 
     /// Keeps some of the Gaussians on the device, and returns them.

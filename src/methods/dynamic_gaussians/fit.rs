@@ -1,5 +1,8 @@
 //! Fit of the Gaussians in the form that configuration and data ask for.
 
+pub mod carried;
+pub(crate) mod fine;
+
 use crate::choice::Choice;
 use crate::config::GaussianForm;
 use crate::error::{Error, Result};
@@ -8,13 +11,13 @@ use crate::fitting::losses::StepLoss;
 use crate::gaussians::field::GaussianField;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
-use crate::methods::dynamic_gaussians::carried::{can_go_on, explains_all};
+use crate::methods::dynamic_gaussians::deformable::start::DeformableStart;
 use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Earlier};
-use crate::methods::dynamic_gaussians::fine::Fine;
+use crate::methods::dynamic_gaussians::fit::carried::{can_go_on, explains_all};
+use crate::methods::dynamic_gaussians::fit::fine::Fine;
 use crate::methods::dynamic_gaussians::made::Made;
 use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
 use crate::methods::dynamic_gaussians::rules::Rules;
-use crate::methods::dynamic_gaussians::start::DeformableStart;
 use crate::methods::dynamic_gaussians::targets::Targets;
 
 /// A fit under way.

@@ -122,7 +122,7 @@ fn slow(left: &Image, level: &[f32], weight: &[f32]) -> Image {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::methods::dynamic_gaussians::test_targets::{PHASES, SIDE, targets};
+    use crate::methods::dynamic_gaussians::targets::test_targets::{PHASES, SIDE, targets};
 
     /// Vessel and background of each phase: a vessel 3 pixels wide, which moves by a pixel at the first three phases, in front
     /// of a static chest; the middle of the image brightens slowly over the beat.

@@ -1,5 +1,7 @@
 //! Several fits to the same images, whose mean is the dynamic field: each fit to noisy or inconsistent images has errors of its own.
 
+pub(in crate::methods::dynamic_gaussians) mod mean;
+
 use crate::config::sections::Rule;
 use crate::error::{Error, Result};
 use crate::gaussians::field::GaussianField;
@@ -32,8 +34,10 @@ impl Targets {
                 FITS_TO_TWO_VIEWS,
                 Some("because two views leave alternatives, and places that few fits find are often false"),
             ),
-            0 if self.is_noisy() && self.applies(Rule::FitsInNoise) => (FITS, Some("because the images are noisy")),
-            0 if self.blades_hide_much() && self.applies(Rule::FitsBehindBlades) => {
+            0 if self.is_noisy() && self.left_out.keeps(Rule::FitsInNoise) => {
+                (FITS, Some("because the images are noisy"))
+            }
+            0 if self.blades_hide_much() && self.left_out.keeps(Rule::FitsBehindBlades) => {
                 (FITS, Some("because blades hide much of the few views"))
             }
             0 if self.views_adjusted => (FITS, Some("because the views had to be adjusted")),
@@ -210,7 +214,7 @@ fn mean(fields: &[GaussianField]) -> Result<GaussianField> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::methods::dynamic_gaussians::test_targets::{PHASES, SIDE, targets};
+    use crate::methods::dynamic_gaussians::targets::test_targets::{PHASES, SIDE, targets};
 
     #[test]
     fn few_views_noise_and_blades_ask_for_several_fits() {

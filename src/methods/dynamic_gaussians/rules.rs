@@ -5,9 +5,9 @@
 //! measurements of [`FAINT`], `link` and `smoothness`. Those of the other numbers were not kept, so a change of them needs measurements of
 //! its own.
 //!
-//! [`Lengths`]: crate::methods::dynamic_gaussians::lengths::Lengths
+//! [`Lengths`]: crate::methods::dynamic_gaussians::targets::lengths::Lengths
 
-use crate::config::sections::{GaussiansSettings, Rule, Train};
+use crate::config::sections::{GaussiansSettings, LeftOut, Train};
 use crate::config::{Config, GaussianForm};
 
 /// Adam's rate of log-scales.
@@ -83,14 +83,7 @@ pub struct GaussianRules {
     /// rates fall; 0 = never.
     pub background_every: u32,
     /// Rules that are left out.
-    pub without: Vec<Rule>,
-}
-
-impl GaussianRules {
-    /// Tells whether a rule applies.
-    pub fn applies(&self, rule: Rule) -> bool {
-        !self.without.contains(&rule)
-    }
+    pub left_out: LeftOut,
 }
 
 /// Numbers of one set that moves.
@@ -140,7 +133,7 @@ impl Rules {
                 clear_at: gaussians.clear_at,
                 link: 4.0,
                 background_every: gaussians.background_every,
-                without: gaussians.without_rules.clone(),
+                left_out: gaussians.without_rules.clone(),
             },
             deformable: DeformableRules {
                 warm_iterations: deformable.warm_iterations,

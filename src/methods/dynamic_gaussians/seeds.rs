@@ -1,10 +1,12 @@
 //! First places of Gaussians, drawn from the hull's cells, and later places where data are missing.
 
+pub(in crate::methods::dynamic_gaussians) mod likelihood;
+
 use crate::gaussians::field::rotation_none;
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::Gaussian;
-use crate::methods::dynamic_gaussians::likelihood::likelihoods;
 use crate::methods::dynamic_gaussians::rules::{GaussianRules, MISSING};
+use crate::methods::dynamic_gaussians::seeds::likelihood::likelihoods;
 use crate::methods::dynamic_gaussians::targets::{PossibleVessel, Targets};
 use crate::random::{STREAM_JITTER, STREAM_PLACE, uniform01};
 use glam::DVec3;

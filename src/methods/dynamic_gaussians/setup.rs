@@ -105,12 +105,12 @@ pub fn grows(settings: &GaussianRules, step: u32) -> bool {
 
 /// Tells whether Gaussians too faint for vessels are dropped before an iteration.
 pub fn clears(settings: &GaussianRules, step: u32) -> bool {
-    settings.clear_at > 0 && step == settings.clear_at && settings.applies(Rule::FaintGaussians)
+    settings.clear_at > 0 && step == settings.clear_at && settings.left_out.keeps(Rule::FaintGaussians)
 }
 
 /// Tells whether Gaussians that stand for no vessel are dropped after an iteration.
 pub fn parts_from_strays(settings: &GaussianRules, step: u32) -> bool {
-    settings.link > 0.0 && step == settings.iterations && settings.applies(Rule::IsolatedGaussians)
+    settings.link > 0.0 && step == settings.iterations && settings.left_out.keeps(Rule::IsolatedGaussians)
 }
 
 /// Tells whether the static background is estimated anew before an iteration. It is not while rates fall, since the fit could
@@ -148,7 +148,7 @@ fn rate(settings: &GaussianRules, step: u32) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::methods::dynamic_gaussians::test_targets::rules;
+    use crate::methods::dynamic_gaussians::targets::test_targets::rules;
 
     #[test]
     fn rates_fall_over_the_last_third() {

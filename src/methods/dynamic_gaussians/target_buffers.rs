@@ -267,7 +267,7 @@ pub(super) fn take_images(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::methods::dynamic_gaussians::test_targets::{PHASES, SIDE, targets};
+    use crate::methods::dynamic_gaussians::targets::test_targets::{PHASES, SIDE, targets};
 
     #[test]
     fn phases_are_divided_into_runs_of_few_images() {

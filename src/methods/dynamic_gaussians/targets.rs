@@ -1,16 +1,23 @@
 //! Targets of Gaussians: views, bounds of the dynamic field's images, weights, and where vessels may be.
 
+pub mod coarse;
+pub mod lengths;
+pub mod shared_images;
+pub(in crate::methods::dynamic_gaussians) mod stiffness;
+#[cfg(test)]
+pub(in crate::methods::dynamic_gaussians) mod test_targets;
+
 use crate::config::GaussianForm;
-use crate::config::sections::Rule;
+use crate::config::sections::{LeftOut, Rule};
 use crate::error::{Error, Result};
 use crate::evidence::ratios::ViewEvidence;
 use crate::evidence::series::Series;
 use crate::gaussians::field::Units;
 use crate::gaussians::view::SplatView;
-use crate::methods::dynamic_gaussians::lengths::{Lengths, vessel_width};
 use crate::methods::dynamic_gaussians::rules::{GaussianRules, NOISE_SCALE};
-use crate::methods::dynamic_gaussians::shared_images::SharedImages;
 use crate::methods::dynamic_gaussians::soft_hull::carve::{HullCell, SoftMotion};
+use crate::methods::dynamic_gaussians::targets::lengths::{Lengths, vessel_width};
+use crate::methods::dynamic_gaussians::targets::shared_images::SharedImages;
 use crate::raster::Image;
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
@@ -78,7 +85,7 @@ pub struct Targets {
     /// Whether the geometry of the views was adjusted with the vessels in the loop.
     pub views_adjusted: bool,
     /// Rules that are left out.
-    pub without: Vec<Rule>,
+    pub left_out: LeftOut,
     /// Cells of the hull, per phase.
     pub places: Vec<Vec<PossibleVessel>>,
     /// Side of a cell, pixels at the isocentre.
@@ -157,7 +164,7 @@ impl Targets {
             rest_phase: 0,
             contrast_comes_and_goes: false,
             views_adjusted: dataset.views_adjusted,
-            without: settings.without.clone(),
+            left_out: settings.left_out.clone(),
             places: Vec::new(),
             cell: motion.hull.cell / units.pixel,
         };
@@ -195,7 +202,7 @@ impl Targets {
         let noise = motion.views.iter().flat_map(|v| v.background.noise.values.iter().map(|s| share(*s)));
         targets.noise = SharedImages::new(noise.collect(), slots, dataset.n_pixels());
         targets.rest_phase = targets.phase_that_shows_most();
-        targets.contrast_comes_and_goes = targets.applies(Rule::Fillings) && targets.some_phase_lacks_contrast();
+        targets.contrast_comes_and_goes = targets.left_out.keeps(Rule::Fillings) && targets.some_phase_lacks_contrast();
         let own = |view: usize, change: &Image| {
             let [width, height] = dataset.views[view].size;
             Image { width, height, values: dataset.own(view, &change.values).into_owned() }
@@ -213,11 +220,6 @@ impl Targets {
         };
         targets.places = motion.hull.cells.iter().map(|cells| cells.iter().map(place).collect()).collect();
         Ok(targets)
-    }
-
-    /// Tells whether a rule applies.
-    pub fn applies(&self, rule: Rule) -> bool {
-        !self.without.contains(&rule)
     }
 
     /// Returns the form of the dynamic field that suits the data where `asked` leaves it open. A deformable set shares one set of

@@ -10,7 +10,7 @@ use crate::kernels::layout::{Gaussian, GaussianSetup, MotionGridSetup};
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
-use crate::methods::dynamic_gaussians::filling::{FILLING_RATE, MIN_FILLING};
+use crate::methods::dynamic_gaussians::deformable::filling::{FILLING_RATE, MIN_FILLING};
 use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
 use crate::methods::dynamic_gaussians::rules::{GaussianRules, Rules};
 use crate::methods::dynamic_gaussians::targets::Targets;

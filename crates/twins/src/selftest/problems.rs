@@ -1,14 +1,15 @@
 //! Problems small enough for f64 twins: configurations and Gaussians that need no file.
 
+use crate::config::sections::LeftOut;
 use crate::config::{Config, Preset};
 use crate::error::{Error, Result};
 use crate::gaussians::field::{GaussianField, Gaussians, MovingGaussians, Units};
 use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry};
 use crate::kernels::layout::{Gaussian, GaussianSetup, MotionGridSetup};
-use crate::methods::dynamic_gaussians::lengths::Lengths;
 use crate::methods::dynamic_gaussians::rules::{DeformableRules, GaussianRules, Rules};
-use crate::methods::dynamic_gaussians::shared_images::SharedImages;
+use crate::methods::dynamic_gaussians::targets::lengths::Lengths;
+use crate::methods::dynamic_gaussians::targets::shared_images::SharedImages;
 use crate::methods::dynamic_gaussians::targets::{PossibleVessel, Targets};
 use crate::random::{STREAM_JITTER, normal};
 use crate::reference::dynamic_gaussians::DeformableParams;
@@ -144,7 +145,7 @@ pub fn targets(width: usize, height: usize, n_phases: usize) -> Result<Targets> 
         max: Some(all.clone().map(|i| 1.0 + wave(i, 0.37)).collect()),
         contrast_comes_and_goes: false,
         views_adjusted: false,
-        without: Vec::new(),
+        left_out: LeftOut::default(),
         places: vec![Vec::new(); n_phases],
         cell: 1.0,
     })

@@ -26,6 +26,10 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     let size = [23, 17, 29];
     let value = |i: usize| {
         let (x, y, z) = (i % 23, i / 23 % 17, i / (23 * 17));
+        // Blocks that are left out, and one with a single voxel in its corner.
+        if x >= 8 && z < 16 && [x, y, z] != [16, 16, 8] {
+            return 0.0;
+        }
         0.01 + 0.002 * ((x * 7 + y * 3 + z * 5) % 11) as f32
     };
     let values = (0..size.iter().product::<usize>()).map(value).collect();

@@ -12,7 +12,7 @@ use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
 use crate::kernels::layout::MotionGridSetup;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
-use crate::methods::dynamic_gaussians::filling::{FILLING_RATE, FillingBuffers, MIN_FILLING};
+use crate::methods::dynamic_gaussians::deformable::filling::{FILLING_RATE, FillingBuffers, MIN_FILLING};
 use std::ops::Range;
 
 /// Pipelines of the deformable set, beside those of [`crate::gaussians::stages::GaussianKernels`].

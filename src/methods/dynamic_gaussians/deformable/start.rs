@@ -6,10 +6,10 @@ use crate::gaussians::field::{Gaussians, mass};
 use crate::gaussians::particles::Particles;
 use crate::gpu::device::Gpu;
 use crate::kernels::layout::Gaussian;
+use crate::methods::dynamic_gaussians::deformable::stages::Track;
 use crate::methods::dynamic_gaussians::deformable::{DeformableTrainer, Fit};
 use crate::methods::dynamic_gaussians::per_phase::{GaussianTrainer, strong};
 use crate::methods::dynamic_gaussians::rules::{GaussianRules, Rules, TAKE};
-use crate::methods::dynamic_gaussians::stages::Track;
 use crate::methods::dynamic_gaussians::targets::Targets;
 use std::ops::Range;
 

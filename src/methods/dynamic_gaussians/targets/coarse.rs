@@ -2,7 +2,7 @@
 //! iterations need all pixels.
 
 use crate::gaussians::field::Units;
-use crate::methods::dynamic_gaussians::lengths::Lengths;
+use crate::methods::dynamic_gaussians::targets::lengths::Lengths;
 use crate::methods::dynamic_gaussians::targets::{PossibleVessel, Targets, weight_of_noise};
 
 /// Minimum smaller side of a coarse image, pixels: a little more than the images to which the settings refer.
@@ -67,7 +67,7 @@ impl Targets {
             width,
             height,
             views: self.views.iter().map(|view| view.coarser(scale)).collect(),
-            without: self.without.clone(),
+            left_out: self.left_out.clone(),
             image_of: self.image_of.clone(),
             contrast: self.contrast.clone(),
             images: mean(&self.images),
@@ -87,9 +87,10 @@ impl Targets {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::sections::LeftOut;
     use crate::gaussians::view::SplatView;
     use crate::geometry::{CArm, Geometry};
-    use crate::methods::dynamic_gaussians::shared_images::SharedImages;
+    use crate::methods::dynamic_gaussians::targets::shared_images::SharedImages;
     use glam::DVec3;
 
     const WIDTH: usize = 7;
@@ -130,7 +131,7 @@ mod tests {
             rest_phase: 1,
             contrast_comes_and_goes: false,
             views_adjusted: false,
-            without: Vec::new(),
+            left_out: LeftOut::default(),
             places: vec![
                 vec![PossibleVessel { position: DVec3::new(4.0, 6.0, -8.0), evidence: 9.0, far_from_prior: 0.0 }],
                 Vec::new(),

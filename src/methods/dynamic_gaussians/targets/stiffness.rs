@@ -22,7 +22,7 @@ impl Targets {
     /// Tells whether the motion of a deformable set is limited to that of a smooth grid.
     pub fn needs_stiff_motion(&self) -> bool {
         let few = self.n_views <= TWO_VIEWS || self.n_views <= FEW_VIEWS && self.is_noisy();
-        few && self.applies(Rule::StiffMotion)
+        few && self.left_out.keeps(Rule::StiffMotion)
     }
 
     /// Returns the settings of a deformable set with lengths in pixels of the images and the freedom of motion that noise allows.
@@ -38,8 +38,8 @@ impl Targets {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::methods::dynamic_gaussians::test_targets::rules;
-    use crate::methods::dynamic_gaussians::test_targets::{PHASES, SIDE, targets};
+    use crate::methods::dynamic_gaussians::targets::test_targets::rules;
+    use crate::methods::dynamic_gaussians::targets::test_targets::{PHASES, SIDE, targets};
 
     #[test]
     fn motion_is_stiff_with_two_views_and_with_three_noisy_ones() {

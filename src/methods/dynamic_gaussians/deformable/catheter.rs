@@ -4,7 +4,7 @@
 
 use crate::gaussians::field::{MovingGaussians, mass};
 use crate::geometry::MM_PER_UNIT;
-use crate::methods::dynamic_gaussians::linked::{extent, groups, grown};
+use crate::methods::dynamic_gaussians::deformable::linked::{extent, groups, grown};
 use glam::DVec3;
 
 /// Motion, as a share of that of the median Gaussian, below which a Gaussian is slow.

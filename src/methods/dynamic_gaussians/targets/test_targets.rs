@@ -1,13 +1,14 @@
 //! Small targets for the tests of this room.
 
+use crate::config::sections::LeftOut;
 use crate::config::{Config, Preset};
 use crate::gaussians::field::Units;
 use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry};
-use crate::methods::dynamic_gaussians::lengths::Lengths;
 use crate::methods::dynamic_gaussians::rules::Rules;
-use crate::methods::dynamic_gaussians::shared_images::SharedImages;
 use crate::methods::dynamic_gaussians::targets::Targets;
+use crate::methods::dynamic_gaussians::targets::lengths::Lengths;
+use crate::methods::dynamic_gaussians::targets::shared_images::SharedImages;
 
 /// Columns and rows.
 pub const SIDE: usize = 40;
@@ -49,13 +50,13 @@ pub fn targets(images: &[f32], n_views: usize) -> Targets {
         rest_phase: 0,
         contrast_comes_and_goes: false,
         views_adjusted: false,
-        without: Vec::new(),
+        left_out: LeftOut::default(),
         places: vec![Vec::new(); PHASES],
         cell: 1.0,
     }
 }
 
 /// Returns the numbers of the default run.
-pub(super) fn rules() -> Rules {
+pub fn rules() -> Rules {
     Rules::of(&Config::preset(Preset::Fast).of().unwrap())
 }

@@ -3,8 +3,8 @@
 
 use crate::gaussians::field::scales;
 use crate::kernels::layout::{Gaussian, GaussianSetup};
+use crate::methods::dynamic_gaussians::deformable::linked::{extent, groups};
 use crate::methods::dynamic_gaussians::groups::breadth;
-use crate::methods::dynamic_gaussians::linked::{extent, groups};
 use crate::methods::dynamic_gaussians::remainder::remainders;
 use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::raster::percentile;
@@ -156,7 +156,7 @@ fn strongest(traces: &[Trace]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::methods::dynamic_gaussians::test_targets::{PHASES, SIDE, targets};
+    use crate::methods::dynamic_gaussians::targets::test_targets::{PHASES, SIDE, targets};
     use crate::random::normal;
 
     const VIEWS: usize = 3;

@@ -87,7 +87,7 @@ pub fn vessel_width(images: impl Iterator<Item = impl Borrow<Image>>, strongest:
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::methods::dynamic_gaussians::test_targets::rules;
+    use crate::methods::dynamic_gaussians::targets::test_targets::rules;
 
     /// A vessel across the whole image, `width` pixels wide across its direction (degrees).
     fn vessel(width: f64, angle_deg: f64) -> Image {

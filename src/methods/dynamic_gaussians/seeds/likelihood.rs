@@ -30,7 +30,7 @@ pub(super) fn likelihoods(targets: &Targets, phase: usize) -> Vec<f64> {
     let views: Vec<(usize, &SplatView)> = targets.views_at(phase).collect();
     let of = |place: &PossibleVessel| {
         let log_odds = match views.len() {
-            2 if targets.applies(Rule::LikelihoodOfTwoViews) => log_odds_of_two(targets, &views, place),
+            2 if targets.left_out.keeps(Rule::LikelihoodOfTwoViews) => log_odds_of_two(targets, &views, place),
             n => log_odds(place.evidence, n),
         };
         sigmoid(log_odds - FAR_LOG_ODDS * place.far_from_prior)
@@ -75,7 +75,7 @@ fn sigmoid(x: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::methods::dynamic_gaussians::test_targets::{PHASES, SIDE, targets};
+    use crate::methods::dynamic_gaussians::targets::test_targets::{PHASES, SIDE, targets};
 
     /// Targets whose views each show a bright and a faint vertical vessel, at columns 10 and 25.
     fn two_vessels(n_views: usize) -> Targets {

@@ -6,8 +6,8 @@ use crate::gaussians::field::MovingGaussians;
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gpu::device::Gpu;
 use crate::kernels::layout::{Gaussian, GaussianSetup};
-use crate::methods::dynamic_gaussians::filling::{Filling, FillingBuffers};
-use crate::methods::dynamic_gaussians::stages::{OwnMotion, OwnMotionBuffers};
+use crate::methods::dynamic_gaussians::deformable::filling::{Filling, FillingBuffers};
+use crate::methods::dynamic_gaussians::deformable::stages::{OwnMotion, OwnMotionBuffers};
 use glam::DVec3;
 
 /// Gaussians with the optimiser's moments.
