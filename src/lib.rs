@@ -129,6 +129,7 @@ pub mod plan;
 
 /// Rendering of a model for any pose and phase.
 pub mod render {
+    mod backgrounds;
     pub mod baked;
     pub mod grid;
     mod kept_images;

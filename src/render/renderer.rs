@@ -23,6 +23,7 @@ use crate::network::forward::{ForwardBuffers, PoseBuffers};
 use crate::network::pass::Pass;
 use crate::network::static_network::StaticNetwork;
 use crate::network::{Network, Purpose, largest_chunk};
+use crate::render::backgrounds::{Background, BackgroundOf, Backgrounds};
 use crate::render::quantity::{Projection, Quantity};
 use crate::scan::gating::BeatTime;
 use bytemuck::Zeroable;
@@ -254,6 +255,7 @@ impl Renderer {
     }
 
     fn set_params(&self, model: &Model) -> Result<()> {
+        self.alone().backgrounds.forget();
         self.gpu.upload(&self.buffers.params, 0, &model.params)?;
         Ok(self.buffers.schedule.write(&[model.config.schedule(model.step)])?)
     }
@@ -265,7 +267,7 @@ impl Renderer {
     /// # Errors
     /// [`Error::Internal`] when the buffer has another size; device errors.
     pub fn follow(&self, params: &Buffer, schedule: Schedule) -> Result<Commands> {
-        let _alone = self.alone();
+        self.alone().backgrounds.forget();
         let mut recording = Recording::new(&self.gpu, "follow")?;
         recording.copy(params, 0, &self.buffers.params, 0, self.param_map.len as u64 * 4)?;
         self.buffers.schedule.write(&[schedule])?;
@@ -490,6 +492,12 @@ impl Renderer {
         parts: RenderedParts,
     ) -> Result<Rendering> {
         let (pixels, image_width) = ((width * height) as u32, width as u32);
+        let of = BackgroundOf { view: View::of(rays), size: (width, height), parts };
+        let stays = self.background_stays(parts);
+        let (background, model) = self.alone().backgrounds.find(&of);
+        let background = background.filter(|_| stays);
+        // A background that was drawn already is not drawn again.
+        let parts = RenderedParts { static_field: parts.static_field && background.is_none(), ..parts };
         let pace = &self.paces[usize::from(parts.static_field) + 2 * usize::from(parts.maxima)];
         let (mut out, mut first_pixel) = (Rendering::default(), 0);
         while first_pixel < pixels {
@@ -497,6 +505,10 @@ impl Renderer {
             let mut drawn = self.alone();
             let n_rays = rays_at_once(pace, image_width).min(pixels - first_pixel);
             let begin = Instant::now();
+            if let Some(background) = &background {
+                let pixels = first_pixel as usize..(first_pixel + n_rays) as usize;
+                self.gpu.upload(&self.buffers.ray_out, 0, &background.seen[pixels])?;
+            }
             let strip = drawn.strip(self, Strip { n_rays, image_width, parts }, taken, blobs)?;
             strip.of.views.write(&[View::of(rays)])?;
             strip.of.pose.write(&[pose(taken, &self.setup, first_pixel)])?;
@@ -514,11 +526,19 @@ impl Renderer {
             out.extend(&seen);
             first_pixel += n_rays;
         }
+        if stays && background.is_none() {
+            self.alone().backgrounds.keep(Background::new(of, &out), model);
+        }
         if let Some(pictures) = self.pictures.as_ref().filter(|pictures| pictures.are_blended()) {
             out.dynamic_integral = pictures.draw(rays, (width, height), taken.phase)?;
             out.is_blended = true;
         }
         Ok(out)
+    }
+
+    /// Tells whether the static field is drawn by itself, with Gaussians in front of it: then it is the same at all times.
+    fn background_stays(&self, parts: RenderedParts) -> bool {
+        parts.static_field && self.blobs.is_some() && self.field.is_none()
     }
 
     /// Tells whether the live samples of `n_rays` rays are counted before they are drawn. A hull leaves out most of them, so a
@@ -600,6 +620,7 @@ const MAX_RECORDED: usize = 16;
 /// Strips drawn so far.
 #[derive(Default)]
 pub(super) struct Drawn {
+    backgrounds: Backgrounds,
     /// Strips of fields that are networks, whose commands are the same at all times.
     recorded: HashMap<Strip, RecordedStrip>,
     /// Last strip of any other field.
@@ -636,9 +657,9 @@ pub(super) fn pose(taken: BeatTime, setup: &Setup, first_pixel: u32) -> Pose {
 
 /// Parts of a rendering that are wanted; the rest is undefined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-struct RenderedParts {
+pub(super) struct RenderedParts {
     /// The static field.
-    static_field: bool,
+    pub(super) static_field: bool,
     /// Maxima along rays.
-    maxima: bool,
+    pub(super) maxima: bool,
 }

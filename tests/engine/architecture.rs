@@ -180,7 +180,8 @@ fn uses(sources: &[(String, String)]) -> BTreeMap<String, BTreeSet<String>> {
         (!parts.is_empty()).then(|| parts.join("::"))
     };
     let of_file = |(path, text): &(String, String)| {
-        let (own, text) = (name(path), code(text).collect::<Vec<_>>().join(" "));
+        // The module to which an item is visible is not one that is used.
+        let (own, text) = (name(path), code(text).collect::<Vec<_>>().join(" ").replace("pub(in crate::", ""));
         let parent = own.rsplit_once("::").map_or(String::new(), |(parent, _)| format!("{parent}::"));
         let listed = |rest: &str| {
             let end = rest.find(|c: char| !(c.is_alphanumeric() || "_:".contains(c))).unwrap_or(rest.len());

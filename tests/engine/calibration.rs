@@ -43,9 +43,7 @@ fn views_are_brought_together() {
     let moved = Wrong { angle_deg: 0.5, shift_mm: 1.0, ..none };
     let breathing = Wrong { breathing_mm: 3.0, ..none };
     let cases = [
-        (3, none, Correction::Stated, 0.05),
-        (4, Wrong { noise: 0.1, ..none }, Correction::Stated, 0.05),
-        (3, moved, Correction::Static, 0.15),
+        (3, Wrong { noise: 0.1, ..none }, Correction::Stated, 0.05),
         (4, Wrong { noise: 0.1, ..moved }, Correction::Static, 0.3),
         (3, breathing, Correction::Breathing, 0.2),
         (4, Wrong { breathing_mm: 3.0, angle_deg: 0.25, shift_mm: 0.5, ..none }, Correction::Breathing, 0.3),
@@ -96,9 +94,7 @@ fn blades_do_not_pull_views_apart() {
     let none = Wrong { seed: 11, ..Wrong::default() };
     let moved = Wrong { angle_deg: 0.5, shift_mm: 1.0, ..none };
     let mut failures = Vec::new();
-    for (n_views, blades, share, wrong, max) in
-        [(3, 3, 0.35, none, 0.05), (4, 4, 0.35, none, 0.05), (3, 2, 0.15, moved, 1.0), (4, 4, 0.15, moved, 0.5)]
-    {
+    for (n_views, blades, share, wrong, max) in [(3, 3, 0.35, none, 0.05), (4, 4, 0.15, moved, 0.5)] {
         let mut shot = studio.shoot(n_views, wrong);
         with_blades(&mut shot, blades, share);
         let (calibration, error) = calibrated(&shot, "auto");

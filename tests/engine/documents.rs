@@ -1,5 +1,6 @@
 //! Documents say what is: the pages of figures stay short, no document tells history, and links lead somewhere.
 
+use crate::architecture::files;
 use crate::root::root;
 use nertca_vk::choice::Choice;
 use nertca_vk::config::sections::Rule;
@@ -93,14 +94,8 @@ fn links_lead_somewhere() {
 #[test]
 fn each_rule_can_be_left_out_and_a_study_does_so() {
     let study = std::fs::read_to_string(root().join("studies/rules.toml")).unwrap();
-    let room = root().join("src/methods/dynamic_gaussians");
-    let sources: String = room
-        .read_dir()
-        .unwrap()
-        .map(|entry| entry.unwrap().path())
-        .filter(|path| path.is_file())
-        .map(|path| std::fs::read_to_string(path).unwrap())
-        .collect();
+    let room = files("src/methods/dynamic_gaussians");
+    let sources: String = room.into_iter().map(|(_, text)| text).collect();
     for rule in Rule::ALL {
         let method = format!("set = ['gaussians.without_rules=[\"{}\"]']", rule.name());
         assert!(study.contains(&method), "studies/rules.toml has no method with {method}");

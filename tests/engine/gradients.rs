@@ -7,6 +7,7 @@ use nertca_vk::fields::data::FieldData;
 use nertca_vk::plan::Plan;
 use nertca_vk::random;
 use nertca_vk_twins::reference::field::{self, Precision};
+use nertca_vk_twins::reference::losses::Losses;
 use nertca_vk_twins::reference::{march, step};
 use nertca_vk_twins::selftest::networks::LARGE;
 
@@ -76,12 +77,15 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
         let plan = plan(preset, settings);
         let params = start(&plan);
         let rays = march::batch(&plan, 3);
-        let (_, gradient) = step::loss_and_gradient(&plan, &params, 3, &rays, Precision::Exact);
+        let (losses, gradient) = step::loss_and_gradient(&plan, &params, 3, &rays, Precision::Exact);
         let temporal = plan.setup.temporal_target != 0;
         for tensor in plan.params.tensors() {
             // With a temporal target S is fitted to the residual of D, with D taken as constant: the two fields minimise
             // different objectives, and each is checked against its own.
             let is_static = tensor.name.starts_with("static");
+            let of = |losses: &Losses| if temporal && !is_static { losses.dynamic } else { losses.total() };
+            // Rounding errors of the loss, divided by the step.
+            let rounding = 1e-8 * (1.0 + of(&losses));
             // A few elements of each tensor, with the largest gradient among a stride.
             let mut at: Vec<usize> = tensor.positions.iter().map(|p| *p as usize).collect();
             at.sort_by(|a, b| gradient[*b].abs().total_cmp(&gradient[*a].abs()));
@@ -89,15 +93,12 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
                 let loss = |value: f64| {
                     let mut moved = params.clone();
                     moved[i] = value;
-                    let losses = step::loss_and_gradient(&plan, &moved, 3, &rays, Precision::Exact).0;
-                    if temporal && !is_static { losses.dynamic } else { losses.total() }
+                    of(&step::loss_and_gradient(&plan, &moved, 3, &rays, Precision::Exact).0)
                 };
                 // Small enough to stay between ReLU kinks, large enough for f64 differences.
                 let h = 1e-7;
                 let difference = (loss(params[i] + h) - loss(params[i] - h)) / (2.0 * h);
                 let error = (difference - gradient[i]).abs();
-                // Rounding errors of the loss, divided by the step.
-                let rounding = 1e-8 * (1.0 + loss(params[i]));
                 assert!(
                     error <= 1e-4 * gradient[i].abs() + rounding,
                     "{preset} {}: {difference} against {}",

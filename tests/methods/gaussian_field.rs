@@ -49,6 +49,32 @@ fn integrals_and_maxima_match_their_twin() {
     expect_silence(gpu);
 }
 
+/// A renderer keeps the background of a view, which is that of the same model alone.
+#[test]
+fn a_view_is_drawn_as_by_a_renderer_that_drew_nothing_else() {
+    let gpu = gpu();
+    let dataset = common::small_dataset(37, 29);
+    let new = |model: &Model| Renderer::new(&gpu, model, tuning(&gpu)).unwrap();
+    let seen = |renderer: &Renderer, view: usize| {
+        let seen = renderer.render(&dataset.views[view].rays, 37, 29, 2).unwrap();
+        [seen.static_integral, seen.dynamic_integral, seen.static_max, seen.dynamic_max, seen.total_max]
+    };
+    let [field, _] = drawn_fields();
+    let first = model(&gpu, &dataset, field);
+    let mut other = first.clone();
+    other.params.iter_mut().for_each(|p| *p *= 1.5);
+    let renderer = new(&first);
+    // At another phase, and through another view.
+    renderer.render(&dataset.views[1].rays, 37, 29, 0).unwrap();
+    renderer.render(&dataset.views[0].rays, 37, 29, 0).unwrap();
+    assert_eq!(seen(&renderer, 1), seen(&new(&first), 1));
+    renderer.set_model(&other).unwrap();
+    assert_eq!(seen(&renderer, 1), seen(&new(&other), 1));
+    assert_ne!(seen(&new(&other), 1)[0], seen(&new(&first), 1)[0]);
+    drop(renderer);
+    expect_silence(gpu);
+}
+
 #[test]
 fn cells_match_their_twin() {
     let gpu = gpu();
