@@ -1,25 +1,25 @@
 //! Commands of the program, and the function that executes each.
 
-use super::bench::{self, BenchArgs};
-use super::calibrate::{self, CalibrateArgs};
-use super::check::{self, CheckArgs};
-use super::data::{self, ImportArgs};
-use super::devices::{self, CompletionsArgs, DevicesArgs};
-use super::eval::{self, EvalArgs};
-use super::export::{self, ConvertArgs, ExportArgs};
-use super::info::{self, InfoArgs};
-use super::kernels::{self, KernelsArgs};
-use super::next::{self, NextArgs};
-use super::options::GlobalOptions;
-use super::progress::clean_up_on_signals;
-use super::render::{self, RenderArgs};
-use super::selftest::{self, SelftestArgs};
-use super::study::{self, StudyArgs};
-use super::synthetic_args::{PhantomArgs, ProjectArgs};
-use super::train::{self, TrainArgs};
-use super::tree::{self, TreeArgs};
-use super::view::{self, ViewArgs};
-use super::watch::{self, WatchArgs};
+use crate::args::options::GlobalOptions;
+use crate::args::synthetic_args::{PhantomArgs, ProjectArgs};
+use crate::command::bench::{self, BenchArgs};
+use crate::command::calibrate::{self, CalibrateArgs};
+use crate::command::check::{self, CheckArgs};
+use crate::command::data::{self, ImportArgs};
+use crate::command::devices::{self, CompletionsArgs, DevicesArgs};
+use crate::command::eval::{self, EvalArgs};
+use crate::command::export::{self, ConvertArgs, ExportArgs};
+use crate::command::info::{self, InfoArgs};
+use crate::command::kernels::{self, KernelsArgs};
+use crate::command::next::{self, NextArgs};
+use crate::command::render::{self, RenderArgs};
+use crate::command::selftest::{self, SelftestArgs};
+use crate::command::study::{self, StudyArgs};
+use crate::command::train::{self, TrainArgs};
+use crate::command::tree::{self, TreeArgs};
+use crate::progress::clean_up_on_signals;
+use crate::viewer::view::{self, ViewArgs};
+use crate::watch::{self, WatchArgs};
 use clap::{CommandFactory, Parser, Subcommand};
 use nertca_vk::error::Result;
 

@@ -1,6 +1,6 @@
 //! Selection of the device and of the computation paths by the options.
 
-use super::options::GlobalOptions;
+use crate::args::options::GlobalOptions;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};

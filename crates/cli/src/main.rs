@@ -14,55 +14,69 @@ macro_rules! eprintln {
     };
 }
 
-mod bench;
-mod bench_report;
-mod calibrate;
-mod calibration_table;
-mod check;
+/// Arguments of commands.
+mod args {
+    pub(crate) mod dicom_args;
+    pub(crate) mod options;
+    pub(crate) mod picture_args;
+    pub(crate) mod rtk_args;
+    pub(crate) mod synthetic_args;
+    pub(crate) mod viewpoint;
+}
+
+/// Commands, one file for each.
+mod command {
+    pub(crate) mod bench;
+    pub(crate) mod calibrate;
+    pub(crate) mod check;
+    pub(crate) mod data;
+    pub(crate) mod devices;
+    pub(crate) mod eval;
+    pub(crate) mod export;
+    pub(crate) mod info;
+    pub(crate) mod kernels;
+    pub(crate) mod next;
+    pub(crate) mod render;
+    pub(crate) mod selftest;
+    pub(crate) mod study;
+    pub(crate) mod train;
+    pub(crate) mod tree;
+}
+
+/// Pages, tables and pictures of results.
+mod pages {
+    pub(crate) mod bench_report;
+    pub(crate) mod calibration_table;
+    pub(crate) mod geometry_picture;
+    pub(crate) mod lesion_section;
+    pub(crate) mod lettering;
+    pub(crate) mod page;
+    pub(crate) mod plot;
+    pub(crate) mod report;
+    pub(crate) mod score_table;
+    pub(crate) mod study_page;
+    pub(crate) mod tree_section;
+    pub(crate) mod tree_table;
+    pub(crate) mod volume_table;
+}
+
+/// The viewer in a browser and the OpenIGTLink server.
+mod viewer {
+    pub(crate) mod frame_rates;
+    pub(crate) mod igtl_server;
+    pub(crate) mod view;
+    pub(crate) mod view_server;
+    pub(crate) mod view_tree;
+}
+
 mod commands;
-mod data;
 mod device;
-mod devices;
-mod dicom_args;
-mod eval;
 mod exit;
-mod export;
-mod frame_rates;
-mod geometry_picture;
-mod igtl_server;
-mod info;
-mod kernels;
-mod lesion_section;
-mod lettering;
 mod memory;
-mod next;
-mod options;
 mod output;
-mod page;
-mod picture_args;
-mod plot;
 mod progress;
-mod render;
-mod report;
-mod rtk_args;
-mod score_table;
-mod selftest;
 mod stdout;
-mod study;
-mod study_page;
-mod synthetic_args;
-mod train;
-mod tree;
-mod tree_section;
-mod tree_table;
-mod view;
-mod view_server;
-mod view_tree;
-mod viewpoint;
-mod volume_table;
 mod watch;
-mod watch_leave;
-mod watch_live;
 
 use clap::Parser;
 use commands::Cli;

@@ -1,6 +1,6 @@
 //! Progress of a run, as text for people and as JSON for programs, and the signals that stop it.
 
-use super::stdout::printable;
+use crate::stdout::printable;
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::fitting::losses::LargeLoss;
@@ -22,7 +22,7 @@ pub fn stop_flag() -> Result<Arc<AtomicBool>> {
     let seen = stop.clone();
     ctrlc::set_handler(move || {
         if seen.swap(true, Ordering::Relaxed) {
-            super::exit::interrupted();
+            crate::exit::interrupted();
         }
         eprintln!("nertca-vk: the program will stop after the current work; press Ctrl-C again to stop immediately");
     })
@@ -33,7 +33,7 @@ pub fn stop_flag() -> Result<Arc<AtomicBool>> {
 /// Makes Ctrl-C and SIGTERM end the program at once, after what it is writing has been removed. For commands without work that
 /// could be continued.
 pub fn clean_up_on_signals() -> Result<()> {
-    ctrlc::set_handler(|| super::exit::interrupted())
+    ctrlc::set_handler(|| crate::exit::interrupted())
         .map_err(|e| Error::Internal(format!("the Ctrl-C handler could not be set: {e}")))
 }
 

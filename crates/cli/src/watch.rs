@@ -1,13 +1,16 @@
 //! `watch`: reconstructs DICOM runs as they appear in a folder.
 
-use super::dicom_args::DicomArgs;
-use super::igtl_server::IgtlServer;
-use super::options::{ConfigArgs, GlobalOptions};
-use super::progress::stop_flag;
-use super::view_server::{AngiogramGeometry, Server};
-use super::view_tree::TreeWork;
-use super::watch_leave::{TrainedRun, prepare, remove_empty};
-use super::watch_live::Live;
+mod watch_leave;
+mod watch_live;
+
+use crate::args::dicom_args::DicomArgs;
+use crate::args::options::{ConfigArgs, GlobalOptions};
+use crate::progress::stop_flag;
+use crate::viewer::igtl_server::IgtlServer;
+use crate::viewer::view_server::{AngiogramGeometry, Server};
+use crate::viewer::view_tree::TreeWork;
+use crate::watch::watch_leave::{TrainedRun, prepare, remove_empty};
+use crate::watch::watch_live::Live;
 use clap::Args;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
@@ -76,7 +79,7 @@ pub fn run(global: &GlobalOptions, args: &WatchArgs) -> Result<()> {
     let (config, options) = (args.config.load([])?, args.reading.options()?);
     // Runs come in an order that nobody knows, so what is stated is stated of all.
     let stated = args.reading.stated(1)?.remove(0);
-    let prior = super::train::prior(args.prior.as_deref(), &config)?;
+    let prior = crate::command::train::prior(args.prior.as_deref(), &config)?;
     let mut folder = Folder::new(&args.directory);
     folder.look()?;
     let _lock = prepare(&args.out)?;

@@ -19,32 +19,17 @@ pub mod vessels {
 /// Vessels as trees of centrelines with radii, followed over the beat.
 pub mod trees {
     pub mod areas;
-    mod blur;
-    mod branches;
     pub mod doubt;
     pub mod extract;
     pub mod files;
-    mod follow;
-    mod graph;
     mod information;
     pub mod lesions;
-    #[cfg(feature = "dicom")]
-    pub mod measurements;
     pub mod next_view;
-    #[cfg(feature = "dicom")]
-    pub mod over_frames;
-    mod radii;
     mod refine;
     mod ridges;
     mod sampled;
-    mod shadowed;
-    mod shadows;
     pub mod sight;
-    mod slides;
-    mod solid;
-    mod tidy;
     pub mod tree;
-    mod tubes;
 }
 
 /// Quality measures of a reconstruction.

@@ -6,14 +6,19 @@
 //! over each other in a view share its pixels. Errors of the places of points along their vessels are found beside the areas; the blur along
 //! vessels that the rest of them causes is taken out at the end.
 
+pub(in crate::trees) mod blur;
+mod shadowed;
+mod shadows;
+mod slides;
+
 use crate::calibrate::observed::binned_to;
 use crate::evidence::series::Series;
 use crate::linear::conjugate_gradients;
 use crate::raster::percentile;
 use crate::scan::dataset::Dataset;
-use crate::trees::blur::without_blur;
-use crate::trees::shadowed::ShadowedView;
-use crate::trees::slides::Slides;
+use crate::trees::areas::blur::without_blur;
+use crate::trees::areas::shadowed::ShadowedView;
+use crate::trees::areas::slides::Slides;
 use crate::trees::tree::{BeatTree, PhaseTree, RadiiFrom};
 use std::f64::consts::PI;
 

@@ -1,5 +1,12 @@
 //! Extraction of a model's vessels as trees.
 
+mod branches;
+mod follow;
+pub(in crate::trees) mod graph;
+mod radii;
+mod solid;
+mod tidy;
+
 use crate::error::{Error, Result};
 use crate::export::volumes::grid_over;
 use crate::gaussians::field::GaussianField;
@@ -8,14 +15,14 @@ use crate::model::Model;
 use crate::model::component::Component;
 use crate::render::grid::PatientGrid;
 use crate::render::renderer::Renderer;
-use crate::trees::branches::chains;
-use crate::trees::follow::Carrier;
-use crate::trees::graph::Forest;
-use crate::trees::radii::Lumen;
+use crate::trees::extract::branches::chains;
+use crate::trees::extract::follow::Carrier;
+use crate::trees::extract::graph::Forest;
+use crate::trees::extract::radii::Lumen;
+use crate::trees::extract::solid::make_solid;
+use crate::trees::extract::tidy::{bridge_gaps, bridge_stenoses, drop_specks, prune_spurs};
 use crate::trees::refine::{Centring, STEP, evenly, from_voxels};
 use crate::trees::sampled::SampledField;
-use crate::trees::solid::make_solid;
-use crate::trees::tidy::{bridge_gaps, bridge_stenoses, drop_specks, prune_spurs};
 use crate::trees::tree::{BeatTree, Branch, PhaseTree, RadiiFrom};
 use crate::vessels::centreline::centreline;
 use crate::vessels::distances::DistanceMap;

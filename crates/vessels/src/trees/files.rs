@@ -1,13 +1,19 @@
 //! File formats of trees (see `docs/formats.md`): JSON, VTK, SWC and glTF.
 
+#[cfg(feature = "dicom")]
+pub mod measurements;
+#[cfg(feature = "dicom")]
+pub mod over_frames;
+mod tubes;
+
 use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::swc;
 use crate::formats::vtp::{self, Values};
+use crate::trees::files::tubes::to_glb;
 use crate::trees::lesions::{Lesion, MeasuredBeat, lesions};
 use crate::trees::sight::TreeInView;
 use crate::trees::tree::{BeatTree, Branch, Doubt, PhaseTree, RadiiFrom, TreeView};
-use crate::trees::tubes::to_glb;
 use glam::DVec3;
 use serde::Serialize;
 use std::path::{Path, PathBuf};

@@ -1,7 +1,7 @@
 //! Stenoses: places where a vessel is narrower than its course elsewhere lets expect.
 
 use crate::linear::Pentadiagonal;
-use crate::trees::blur::without_blur;
+use crate::trees::areas::blur::without_blur;
 use crate::trees::tree::{BeatTree, Measurement, PhaseTree, RadiiFrom};
 use glam::DVec3;
 use std::f64::consts::TAU;
