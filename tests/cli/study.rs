@@ -128,8 +128,9 @@ fn faults_have_their_line() {
 fn our_studies_can_be_run() {
     let data = tempfile::tempdir().unwrap();
     std::fs::create_dir(data.path().join("anatomy")).unwrap();
-    for file in ["coronary_tree_hra.json", "thorax_ct.nii.gz"] {
-        std::fs::write(data.path().join("anatomy").join(file), b"stands in for it").unwrap();
+    for file in ["anatomy/coronary_tree_hra.json", "anatomy/thorax_ct.nii.gz", "l3.json", "r3.json", "thorax_ct.nii.gz"]
+    {
+        std::fs::write(data.path().join(file), b"stands in for it").unwrap();
     }
     let studies = Path::new(SMOKE).parent().unwrap();
     let expected = [
