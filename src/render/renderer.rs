@@ -255,7 +255,9 @@ impl Renderer {
     }
 
     fn set_params(&self, model: &Model) -> Result<()> {
-        self.alone().backgrounds.forget();
+        // Nothing is drawn between the old parameters and the new ones.
+        let mut drawn = self.alone();
+        drawn.backgrounds.forget();
         self.gpu.upload(&self.buffers.params, 0, &model.params)?;
         Ok(self.buffers.schedule.write(&[model.config.schedule(model.step)])?)
     }
@@ -267,7 +269,8 @@ impl Renderer {
     /// # Errors
     /// [`Error::Internal`] when the buffer has another size; device errors.
     pub fn follow(&self, params: &Buffer, schedule: Schedule) -> Result<Commands> {
-        self.alone().backgrounds.forget();
+        let mut drawn = self.alone();
+        drawn.backgrounds.forget();
         let mut recording = Recording::new(&self.gpu, "follow")?;
         recording.copy(params, 0, &self.buffers.params, 0, self.param_map.len as u64 * 4)?;
         self.buffers.schedule.write(&[schedule])?;
