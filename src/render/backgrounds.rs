@@ -1,7 +1,7 @@
 //! Backgrounds of drawn views: a static field is the same behind the Gaussians of all phases, so that its rays are marched once per view.
 
 use crate::kernels::layout::{RayOut, View};
-use crate::render::renderer::{RenderedParts, Rendering};
+use crate::render::quantity::RenderedParts;
 use bytemuck::Zeroable;
 use std::sync::Arc;
 
@@ -22,10 +22,11 @@ pub(super) struct Background {
 }
 
 impl Background {
-    pub(super) fn new(of: BackgroundOf, drawn: &Rendering) -> Background {
+    /// Takes integrals and maxima of the static field, by pixel.
+    pub(super) fn new(of: BackgroundOf, integrals: &[f32], maxima: &[f32]) -> Background {
         let ray =
             |(integral, max): (&f32, &f32)| RayOut { static_integral: *integral, static_max: *max, ..RayOut::zeroed() };
-        Background { of, seen: drawn.static_integral.iter().zip(&drawn.static_max).map(ray).collect() }
+        Background { of, seen: integrals.iter().zip(maxima).map(ray).collect() }
     }
 }
 

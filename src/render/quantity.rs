@@ -21,3 +21,12 @@ pub struct Quantity {
     /// How the fields are projected.
     pub projection: Projection,
 }
+
+/// Parts of a rendering that are wanted; the rest is undefined.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) struct RenderedParts {
+    /// The static field.
+    pub(super) static_field: bool,
+    /// Maxima along rays.
+    pub(super) maxima: bool,
+}

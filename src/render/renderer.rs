@@ -24,7 +24,7 @@ use crate::network::pass::Pass;
 use crate::network::static_network::StaticNetwork;
 use crate::network::{Network, Purpose, largest_chunk};
 use crate::render::backgrounds::{Background, BackgroundOf, Backgrounds};
-use crate::render::quantity::{Projection, Quantity};
+use crate::render::quantity::{Projection, Quantity, RenderedParts};
 use crate::scan::gating::BeatTime;
 use bytemuck::Zeroable;
 use std::collections::HashMap;
@@ -530,7 +530,7 @@ impl Renderer {
             first_pixel += n_rays;
         }
         if stays && background.is_none() {
-            self.alone().backgrounds.keep(Background::new(of, &out), model);
+            self.alone().backgrounds.keep(Background::new(of, &out.static_integral, &out.static_max), model);
         }
         if let Some(pictures) = self.pictures.as_ref().filter(|pictures| pictures.are_blended()) {
             out.dynamic_integral = pictures.draw(rays, (width, height), taken.phase)?;
@@ -656,13 +656,4 @@ impl Drawn {
 pub(super) fn pose(taken: BeatTime, setup: &Setup, first_pixel: u32) -> Pose {
     let (beyond, beyond_share) = (taken.beyond(setup.n_phases), taken.after_phase.abs() as f32);
     Pose { first_pixel, phase: taken.phase, beyond, beyond_share }
-}
-
-/// Parts of a rendering that are wanted; the rest is undefined.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) struct RenderedParts {
-    /// The static field.
-    pub(super) static_field: bool,
-    /// Maxima along rays.
-    pub(super) maxima: bool,
 }
