@@ -1,5 +1,5 @@
-//! Fits a deformable set: Gaussians of one phase, carried through the beat by a grid, all of it together. [`crate::methods::dynamic_gaussians::deformable::start`] prepares
-//! it.
+//! Fits a deformable set: Gaussians of one phase, carried through the beat by a grid, all of it together. [`start`]
+//! prepares it.
 
 pub mod catheter;
 pub(in crate::methods::dynamic_gaussians) mod conversions;

@@ -36,6 +36,8 @@ const LEFT_MAX_MM: f64 = 0.5;
 const ALONG_SHARE: f64 = 0.5;
 const ALONG_MAX_MM: f64 = 1.0;
 
+// Lines through the distances from true vessels and the shares of true points that five trees with two views, and degraded data with more views, had
+// at five shares of agreement (`docs/performance.md`, doubt).
 /// Half width of the interval of false crossings with two views, mm, where all other fits have a vessel at the point, its growth with the share
 /// of the fits that have none, and its maximum.
 const FALSE_CROSSINGS_MIN_MM: f64 = 0.2;
