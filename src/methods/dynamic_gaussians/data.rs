@@ -1,6 +1,6 @@
 //! Data of a fit: targets of the Gaussians, and the images of the static field behind them.
 
-pub(in crate::methods::dynamic_gaussians) mod prior;
+mod prior;
 
 use crate::config::sections::GaussiansSettings;
 use crate::config::{Config, GaussianForm};

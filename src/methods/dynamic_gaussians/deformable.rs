@@ -2,15 +2,15 @@
 //! prepares it.
 
 pub mod catheter;
-pub(in crate::methods::dynamic_gaussians) mod conversions;
+mod conversions;
 pub mod filling;
-pub(in crate::methods::dynamic_gaussians) mod linked;
-pub(in crate::methods::dynamic_gaussians) mod members;
+mod linked;
+mod members;
 mod membership;
-pub(in crate::methods::dynamic_gaussians) mod pruning;
+mod pruning;
 pub mod stages;
 pub mod start;
-pub(in crate::methods::dynamic_gaussians) mod unseen;
+mod unseen;
 
 use crate::config::sections::Rule;
 use crate::error::{Error, Result};

@@ -1,6 +1,6 @@
 //! Several fits to the same images, whose mean is the dynamic field: each fit to noisy or inconsistent images has errors of its own.
 
-pub(in crate::methods::dynamic_gaussians) mod mean;
+mod mean;
 
 use crate::config::sections::Rule;
 use crate::error::{Error, Result};

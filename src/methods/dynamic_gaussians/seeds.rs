@@ -1,6 +1,6 @@
 //! First places of Gaussians, drawn from the hull's cells, and later places where data are missing.
 
-pub(in crate::methods::dynamic_gaussians) mod likelihood;
+mod likelihood;
 
 use crate::gaussians::field::rotation_none;
 use crate::gaussians::view::SplatView;
