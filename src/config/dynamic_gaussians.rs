@@ -41,8 +41,6 @@ pub enum GaussianForm {
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
 pub enum Rule {
-    /// Adjusted views are taken only where they leave much less of the images than calibrated ones.
-    Acceptance,
     /// Broad Gaussians that not all views show are dropped.
     BroadParts,
     /// Gaussians far fainter than the vessels are dropped.
@@ -59,7 +57,7 @@ pub enum Rule {
     LikelihoodOfTwoViews,
     /// Short components that the images do not support are dropped.
     ShortParts,
-    /// Motion is stiff with two views, and with three noisy ones.
+    /// Motion is stiff with two views.
     StiffMotion,
     /// The motion of vessels that contrast does not show is that of other phases.
     UnseenPhases,

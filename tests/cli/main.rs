@@ -32,6 +32,7 @@ mod imperfect_angiograms;
 mod inflow;
 mod interfaces;
 mod interop;
+mod lab_runs;
 mod method_runs;
 mod motion;
 mod moving_runs;

@@ -83,23 +83,37 @@ fn frames_that_are_asked_for_are_taken_as_they_are() {
 fn a_run_without_ecg_is_gated_by_its_images() {
     let directory = tempfile::tempdir().unwrap();
     let (file, out) = (directory.path().join("run.dcm"), directory.path().join("data"));
-    // A bar that swings once in 12 frames of 0.1 s.
-    let frames = 30u32;
+    // Contrast agent arrives in a bar that swings once in 12 frames of 0.1 s.
+    let frames = 40u32;
     let swing = |frame: u32| 8.0 * (std::f64::consts::TAU * f64::from(frame) / 12.0).sin();
     let pixel = |frame: u32, p: u32| {
         let bar = (f64::from(p % 64) - 32.0 - swing(frame)).abs() < 1.5 && (10..54).contains(&(p / 64));
-        if bar { 90u8 } else { 190 + (p / 64 / 8) as u8 }
+        if bar && frame > 5 { 90u8 } else { 190 + (p / 64 / 8) as u8 }
     };
     let pixels: Vec<u8> = (0..frames).flat_map(|f| (0..64 * 64).map(move |p| pixel(f, p))).collect();
     dicom::angiogram(&file, |o| {
         o.put(DataElement::new(tags::NUMBER_OF_FRAMES, VR::IS, PrimitiveValue::from(frames.to_string())));
         o.put(DataElement::new(tags::PIXEL_DATA, VR::OB, PrimitiveValue::from(pixels.clone())));
     });
-    let refused = import_dicom(std::slice::from_ref(&file), &options(Gating::Ecg, 6), &out).unwrap_err().to_string();
-    assert!(refused.contains("find the beat in the images"), "{refused}");
-    let told = import_dicom(&[file], &options(Gating::Images, 6), &out).unwrap().join("\n");
+    let import = |gating: Gating, frames: Option<RangeInclusive<usize>>| {
+        import_dicom(std::slice::from_ref(&file), &ImportOptions { frames, ..options(gating, 6) }, &out)
+    };
+    let refused =
+        |gating: Gating, frames: Option<RangeInclusive<usize>>| import(gating, frames).unwrap_err().to_string();
+    assert!(refused(Gating::Ecg, None).contains("find the beat in the images"));
+    let outside = refused(Gating::Images, Some(30..=41));
+    assert!(outside.contains("has frames 1 to 40"), "{outside}");
+    let told = import(Gating::Images, Some(15..=40)).unwrap().join("\n");
     assert!(told.contains("50 beats per minute, found in the images"), "{told}");
-    assert_eq!(Dataset::open(&out).unwrap().frames.len(), 6, "{told}");
+    let (first, _) = told.split_once("the beat of frames ").unwrap().1.split_once(" to ").unwrap();
+    assert!(first.parse::<usize>().unwrap() >= 15, "{told}");
+    let dataset = Dataset::open(&out).unwrap();
+    assert_eq!(dataset.frames.len(), 6, "{told}");
+    // The images are the vessels alone.
+    for frame in &dataset.frames {
+        let seen = frame.integrals.iter().filter(|v| **v > 0.0).count();
+        assert!((60..500).contains(&seen), "{seen} pixels");
+    }
 }
 
 #[test]

@@ -18,7 +18,6 @@ mod dicom_enhanced;
 mod dicom_fragments;
 mod dicom_runs;
 mod dicom_structure;
-mod image_beat;
 mod import_frames;
 mod malformed;
 mod modality_luts;

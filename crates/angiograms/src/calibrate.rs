@@ -14,6 +14,7 @@ pub mod gauge;
 pub mod observed;
 pub mod pose;
 pub mod profiles;
+pub mod runs;
 #[cfg(test)]
 mod samples;
 pub mod settings;

@@ -39,10 +39,13 @@ pub mod evidence {
     pub mod drift;
     mod filters;
     mod interiors;
+    pub mod lines;
     pub mod noise;
     pub mod ratios;
     pub mod series;
 }
+
+pub mod cine;
 
 pub mod calibrate;
 

@@ -8,7 +8,8 @@ use crate::scan::at_rest::{WIDEST_VESSEL_MM, vessel_pixels, without_vessels};
 use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
 use crate::scan::references::ReferencedRun;
 use crate::stands::stands;
-use crate::{beats, image_beat};
+use crate::ungated::{OneBeat, Placed};
+use crate::{beats, ungated};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
@@ -18,7 +19,7 @@ const FILLED_SHARE: f64 = 0.6;
 /// Line integral that corresponds to the full range of display grey values.
 const DISPLAY_SPAN: f64 = 3.0;
 /// Line integral from which an area belongs to the collimator or the detector's rim.
-const DARK: f32 = (0.85 * DISPLAY_SPAN) as f32;
+pub(super) const DARK: f32 = (0.85 * DISPLAY_SPAN) as f32;
 
 /// Source of the phases.
 #[derive(Debug, Clone)]
@@ -29,7 +30,8 @@ pub enum Gating {
     RPeaks(RPeaks),
     /// A steady heart, with an R-peak at the first frame.
     HeartRate(f64),
-    /// Motion of the vessels in each run, assuming a steady heart (see [`image_beat`]).
+    /// The images of each run, assuming a steady heart: frames that are alike are one beat apart. The images of the dataset are then the
+    /// vessels of single frames, and runs are aligned with each other.
     Images,
     /// A list with a phase for each selected frame of each run, in order; a phase may lie between two whole phases.
     Phases(Vec<f64>),
@@ -45,7 +47,7 @@ pub struct ImportOptions {
     pub phases: u32,
     /// Source of the phases.
     pub gating: Gating,
-    /// Conversion of times between R-peaks to phases.
+    /// Conversion of times between R-peaks to phases; not with [`Gating::Images`], where the R-peak is not known.
     pub scaling: BeatScaling,
     /// Frames of each run, counted from 1; without it, the frames filled with contrast.
     pub frames: Option<RangeInclusive<usize>>,
@@ -53,12 +55,20 @@ pub struct ImportOptions {
     pub pixel_mm: Option<[f64; 2]>,
     /// Longest side of the images, pixels; larger images are reduced by averaging.
     pub size: Option<usize>,
-    /// Whether frames of one phase from several beats are averaged; otherwise each phase is taken from one beat.
+    /// Whether frames of one phase from several beats are averaged; otherwise each phase is taken from one beat, as always with
+    /// [`Gating::Images`].
     pub all_beats: bool,
     /// Depth searched before and behind the isocentre, mm.
     pub depth_half_extent_mm: f64,
     /// Whether the dataset keeps references to the runs' files, which name the patient (see [`crate::scan::references`]).
     pub keep_references: bool,
+}
+
+impl ImportOptions {
+    /// Tells whether phases come from the images.
+    fn is_ungated(&self) -> bool {
+        matches!(self.gating, Gating::Images)
+    }
 }
 
 /// An image of a run, ready for training.
@@ -79,6 +89,8 @@ pub(super) struct Prepared {
     pub(super) frames: Vec<TakenFrame>,
     /// Reference to the run's file; none where it is not to be kept.
     pub(super) reference: Option<ReferencedRun>,
+    /// The beat that was found in the images of a run without ECG.
+    pub(super) beat: Option<OneBeat>,
     pub(super) notes: Vec<String>,
 }
 
@@ -89,7 +101,13 @@ impl Prepared {
         if (columns.len(), rows.len()) != (run.width, run.height) {
             notes.push(format!("{}: {} x {} pixels inside the shutters", run.name(), columns.len(), rows.len()));
         }
-        let factor = options.size.map_or(1, |size| columns.len().max(rows.len()).div_ceil(size.max(1)));
+        let factor = match options.size {
+            Some(size) => columns.len().max(rows.len()).div_ceil(size.max(1)),
+            None if options.is_ungated() => {
+                (columns.len().min(rows.len()) as f64 / ungated::SIDE as f64).round().max(1.0) as usize
+            }
+            None => 1,
+        };
         let (width, height) = (columns.len() / factor, rows.len() / factor);
         if let Some(size) = options.size.filter(|size| factor > 1 && *size != width.max(height)) {
             notes.push(format!(
@@ -136,8 +154,25 @@ impl Prepared {
             ..of.clone()
         };
         let c_arms: Vec<CArm> = run.c_arms.iter().map(kept).collect();
-        let stands = stands(&c_arms, [width, height]);
         let at_isocentre = c_arms[0].pixel_mm[0] * c_arms[0].sod_mm / c_arms[0].sid_mm;
+        let referenced = |first: [usize; 2]| match &run.source {
+            _ if !options.keep_references => Ok(None),
+            Some(source) => Ok(Some(ReferencedRun {
+                source: source.clone(),
+                first_px: [columns.start + factor * first[0], rows.start + factor * first[1]],
+                pixels_per_pixel: factor,
+            })),
+            None => {
+                let problem = "are missing or are no UIDs, so that no references to this file can be kept";
+                Err(Error::data(&run.path, "UIDs of study, series, class and image", problem))
+            }
+        };
+        if options.is_ungated() {
+            let beat = OneBeat::of(run, &frames, &c_arms, at_isocentre, options, &mut notes)?;
+            let frames = beat.frames(&Placed::default(), options.phases);
+            return Ok(Prepared { frames, reference: referenced(beat.first)?, beat: Some(beat), notes });
+        }
+        let stands = stands(&c_arms, [width, height]);
         let vessel = vessel_pixels(at_isocentre);
         let selected = select(run, &frames, vessel, options, &mut notes)?;
         let chosen = Chosen { run, frames: &frames, stands: &stands, selected: &selected, vessel };
@@ -156,19 +191,12 @@ impl Prepared {
             image,
             frames,
         };
-        let reference = match &run.source {
-            _ if !options.keep_references => None,
-            Some(source) => Some(ReferencedRun {
-                source: source.clone(),
-                first_px: [columns.start, rows.start],
-                pixels_per_pixel: factor,
-            }),
-            None => {
-                let problem = "are missing or are no UIDs, so that no references to this file can be kept";
-                return Err(Error::data(&run.path, "UIDs of study, series, class and image", problem));
-            }
-        };
-        Ok(Prepared { frames: images.into_iter().map(taken).collect(), reference, notes })
+        Ok(Prepared {
+            frames: images.into_iter().map(taken).collect(),
+            reference: referenced([0, 0])?,
+            beat: None,
+            notes,
+        })
     }
 }
 
@@ -246,7 +274,7 @@ impl Chosen<'_> {
                         "the times of the frames are not known: state the frames per second, or a list of phases",
                     ));
                 }
-                let peaks = self.r_peaks(timed, notes)?;
+                let peaks = self.r_peaks(timed)?;
                 let times_s: Vec<f64> = selected.iter().map(|i| run.times_s[*i]).collect();
                 beat_of = beats::numbers(&times_s, &peaks);
                 times_s.iter().map(|time| peaks.beat_time(*time, n_phases, options.scaling)).collect()
@@ -304,25 +332,11 @@ impl Chosen<'_> {
     }
 
     /// Returns the R-peaks of the run from the requested source.
-    fn r_peaks(&self, gating: &Gating, notes: &mut Vec<String>) -> Result<RPeaks> {
+    fn r_peaks(&self, gating: &Gating) -> Result<RPeaks> {
         let run = self.run;
         match gating {
             Gating::RPeaks(peaks) => Ok(peaks.clone()),
             Gating::HeartRate(rate) => RPeaks::steady(*rate, 0.0, run.times_s.last().copied().unwrap_or(0.0)),
-            Gating::Images => {
-                let images: Vec<&Image> = self.selected.iter().map(|i| &self.frames[*i]).collect();
-                let times_s: Vec<f64> = self.selected.iter().map(|i| run.times_s[*i]).collect();
-                let found = image_beat::beat(&images, &times_s, self.vessel)
-                    .map_err(|e| Error::data(&run.path, "phases", e.to_string()))?;
-                notes.push(format!(
-                    "{}: {:.0} beats per minute, found in the images (the motion of the vessels has a correlation of \
-                     {:.2} with a contracting ventricle); a regular rhythm is assumed",
-                    run.name(),
-                    found.beats_per_min,
-                    found.likeness
-                ));
-                Ok(found.r_peaks)
-            }
             _ => run.r_peaks.clone().ok_or_else(|| {
                 let problem = "there is no ECG: give R-peaks, a heart rate or a list of phases, find the beat in \
                                the images, or state that the object is static";

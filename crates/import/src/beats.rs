@@ -1,6 +1,5 @@
 //! Choice among the beats of a run: frames of one phase from two beats show each vessel twice where the patient breathes.
 
-use crate::image_beat::vessels;
 use crate::raster::{Image, opening, percentile};
 use crate::scan::gating::{BeatTime, RPeaks};
 use rayon::prelude::*;
@@ -8,6 +7,9 @@ use std::collections::BTreeSet;
 
 /// Percentile of the contrast of thin structures that stands for a frame.
 const CONTRAST_PERCENTILE: f64 = 0.98;
+
+/// Longest side of the reduced images, pixels.
+const SIDE: usize = 64;
 
 /// A selected frame of a run, with its place in the rhythm.
 pub(super) struct Beating<'a> {
@@ -111,6 +113,24 @@ fn rate(beat: usize, frames: &[Beating<'_>], contrast: &[f64], maps: &[Vec<f32>]
         contrast: mean(own.iter().map(|i| contrast[*i]).collect()),
         change: mean(own.iter().flat_map(|i| beside(*i)).collect()),
     }
+}
+
+/// Extracts thin structures, such as vessels, on a coarser pixel grid and divides them by their sum, so that the amount of
+/// contrast has no effect.
+fn vessels(image: &Image, vessel_pixels: usize) -> Vec<f32> {
+    let surroundings = opening(image, vessel_pixels);
+    let factor = image.width.max(image.height).div_ceil(SIDE);
+    let (width, height) = (image.width / factor, image.height / factor);
+    let mut out = vec![0.0; width * height];
+    for y in 0..height * factor {
+        for x in 0..width * factor {
+            let p = y * image.width + x;
+            out[y / factor * width + x / factor] += image.values[p] - surroundings.values[p];
+        }
+    }
+    let sum: f32 = out.iter().sum();
+    out.iter_mut().for_each(|v| *v /= sum.max(f32::MIN_POSITIVE));
+    out
 }
 
 /// Contrast of thin dark structures.

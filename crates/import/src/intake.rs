@@ -13,6 +13,7 @@ use crate::scan::references::{REFERENCES, ReferencedImage, ReferencedRun, Refere
 use crate::scan::same_view::find_or_add;
 use crate::scan::writer::{About, Writer};
 use crate::stated::StatedGeometry;
+use crate::ungated::{self, OneBeat};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 
@@ -137,7 +138,25 @@ impl Intake {
         notes.extend(prepared.iter().flat_map(|prepared| prepared.notes.iter().cloned()));
         self.taken = taken;
         self.runs.extend(prepared);
+        notes.extend(self.place());
         Ok(notes)
+    }
+
+    /// Places runs without ECG in a common beat and in the room; returns notes.
+    fn place(&mut self) -> Vec<String> {
+        let ungated = || (0..self.runs.len()).filter(|run| self.runs[*run].beat.is_some());
+        let names: Vec<String> = ungated().map(|run| self.taken[run].name.clone()).collect();
+        let beats: Vec<&OneBeat> = self.runs.iter().filter_map(|run| run.beat.as_ref()).collect();
+        if beats.len() < 2 {
+            return Vec::new();
+        }
+        let (placed, notes) = ungated::place(&beats, &names);
+        let phases = self.options.phases;
+        let placed_runs = self.runs.iter_mut().filter(|run| run.beat.is_some()).zip(placed);
+        for (run, placed) in placed_runs {
+            run.frames = run.beat.as_ref().map(|beat| beat.frames(&placed, phases)).unwrap_or_default();
+        }
+        notes
     }
 
     /// Images of a run; runs are counted from 0.

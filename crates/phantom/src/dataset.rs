@@ -1,5 +1,6 @@
 //! Phantom datasets: projects moving volumes, makes exact masks, applies degradations and writes the dataset.
 
+use crate::acquisition::Acquisition;
 use crate::blades::Blade;
 use crate::choice::Choice;
 use crate::degradations::{Chance, Degradations};
@@ -119,15 +120,15 @@ pub struct VolumeOptions {
 }
 
 /// Subject and geometry that a phantom dataset is made from.
-struct Stage {
+pub(super) struct Stage {
     description: String,
     /// C-arm of each view.
-    c_arms: Vec<CArm>,
+    pub(super) c_arms: Vec<CArm>,
     depth_half_extent_mm: f64,
     vessel_attenuation: Option<f64>,
-    phases: u32,
+    pub(super) phases: u32,
     still: bool,
-    subject: Box<dyn Subject>,
+    pub(super) subject: Box<dyn Subject>,
     /// Stenoses of the vessels.
     lesions: Vec<TrueLesion>,
     /// Whether the moving background already contains the vessels.
@@ -135,11 +136,11 @@ struct Stage {
 }
 
 /// Options of the images that are taken of a stage.
-struct Shooting<'a> {
-    size: usize,
-    views: &'a ViewAngles,
-    seed: u32,
-    degradations: &'a Degradations,
+pub(super) struct Shooting<'a> {
+    pub(super) size: usize,
+    pub(super) views: &'a ViewAngles,
+    pub(super) seed: u32,
+    pub(super) degradations: &'a Degradations,
     layout: Layout,
     /// Interval of the phases whose voxel volumes are also written: the first of every so many.
     volumes_every: Option<NonZeroU32>,
@@ -154,27 +155,51 @@ pub fn make(
     gpu: &Gpu,
     options: &PhantomOptions,
     out: &Path,
+    progress: impl FnMut(&str, u64, u64),
+) -> Result<Vec<String>> {
+    make_with_runs(gpu, options, None, out, progress)
+}
+
+/// Makes a phantom dataset as [`make`] does, and runs of its training views where they are asked for. The degradations then act on the runs,
+/// and the dataset is what is true: it has no degradations but noise.
+///
+/// # Errors
+/// Errors of [`make`]; [`Error::Config`] for impossible runs.
+pub fn make_with_runs(
+    gpu: &Gpu,
+    options: &PhantomOptions,
+    runs: Option<&Acquisition>,
+    out: &Path,
     mut progress: impl FnMut(&str, u64, u64),
 ) -> Result<Vec<String>> {
     if !(1..=200).contains(&options.phases) {
         return Err(Error::config("phases", options.phases, "is not in the accepted range, 1 to 200"));
     }
+    options.degradations.check(options.views.training.len(), options.layout)?;
+    let exact = Degradations { photons: options.degradations.photons, ..Degradations::default() };
     let shooting = Shooting {
         size: options.size,
         views: &options.views,
         seed: options.seed,
-        degradations: &options.degradations,
+        degradations: if runs.is_some() { &exact } else { &options.degradations },
         layout: options.layout,
         volumes_every: options.volumes_every,
     };
     shooting.check(out)?;
+    if let Some(runs) = runs {
+        runs.check(&options.degradations)?;
+    }
     let projector = Projector::new(gpu, options.size, options.size)?;
     progress("volumes", 0, 1);
     let (stage, warnings) = match &options.anatomy {
         None => (procedural(options)?, Vec::new()),
         Some(anatomy) => from_files(options, anatomy)?,
     };
-    shoot(&projector, &stage, &shooting, out, progress)?;
+    shoot(&projector, &stage, &shooting, out, &mut progress)?;
+    if let Some(runs) = runs {
+        let taken = Shooting { degradations: &options.degradations, ..shooting };
+        runs.take(&projector, &stage, &taken, progress)?;
+    }
     Ok(warnings)
 }
 
@@ -291,12 +316,12 @@ impl Shooting<'_> {
         self.degradations.check(self.views.training.len(), self.layout)
     }
 
-    fn chance(&self, view: usize) -> Chance {
+    pub(super) fn chance(&self, view: usize) -> Chance {
         Chance { seed: self.seed, view: view as u32 }
     }
 
     /// C-arm as the dataset states it.
-    fn stated(&self, c_arm: &CArm, view: usize, split: Split) -> CArm {
+    pub(super) fn stated(&self, c_arm: &CArm, view: usize, split: Split) -> CArm {
         match self.degradations.geometry_error {
             Some(error) if split == Split::Train => error.stated(c_arm, self.chance(view)),
             _ => c_arm.clone(),
@@ -305,7 +330,7 @@ impl Shooting<'_> {
 }
 
 /// Takes images of a stage.
-struct Camera<'a> {
+pub(super) struct Camera<'a> {
     projector: &'a Projector,
     stage: &'a Stage,
     rays: Vec<ViewRays>,
@@ -316,13 +341,13 @@ struct Camera<'a> {
 }
 
 /// Line integrals of an image and of its vessels alone.
-struct Exposure {
-    image: Vec<f32>,
+pub(super) struct Exposure {
+    pub(super) image: Vec<f32>,
     vessels: Option<Vec<f32>>,
 }
 
 impl<'a> Camera<'a> {
-    fn new(projector: &'a Projector, stage: &'a Stage, size: usize) -> Result<Camera<'a>> {
+    pub(super) fn new(projector: &'a Projector, stage: &'a Stage, size: usize) -> Result<Camera<'a>> {
         let rays = |c_arm: &CArm| {
             let rays = Geometry::CArm(c_arm.clone()).rays(size, size);
             rays.map_err(|(field, problem)| Error::config(field, "", problem))
@@ -336,22 +361,35 @@ impl<'a> Camera<'a> {
     }
 
     fn expose(&mut self, view: usize, shot: &Shot, catheter: bool) -> Result<Exposure> {
+        let rays = self.rays[view].clone();
+        let still = self.still[view].clone();
+        self.expose_through(&rays, still, shot, catheter)
+    }
+
+    /// Takes an image through some rays, over the static background that these show without breathing.
+    pub(super) fn expose_through(
+        &mut self,
+        rays: &ViewRays,
+        still: Vec<f32>,
+        shot: &Shot,
+        catheter: bool,
+    ) -> Result<Exposure> {
         let pose = Pose { fraction: shot.fraction, breath: shot.breath, catheter, filled_to: shot.filled_to };
         let moving = match self.drawn.take() {
             Some((drawn, moving)) if drawn == pose => moving,
             _ => self.stage.subject.moving(self.projector, &pose)?,
         };
         let mut image = match shot.breath.chest_mm {
-            DVec3::ZERO => self.still[view].clone(),
+            DVec3::ZERO => still,
             chest_mm => match self.stage.subject.still(self.projector, chest_mm)? {
-                Some(volume) => self.project(view, &Placed::at_rest(volume))?,
-                None => self.still[view].clone(),
+                Some(volume) => self.project(rays, &Placed::at_rest(volume))?,
+                None => still,
             },
         };
         for placed in moving.background.iter().chain(&moving.catheter) {
-            add(&mut image, &self.project(view, placed)?, 1.0);
+            add(&mut image, &self.project(rays, placed)?, 1.0);
         }
-        let vessels = moving.vessels.as_ref().map(|placed| self.project(view, placed)).transpose()?;
+        let vessels = moving.vessels.as_ref().map(|placed| self.project(rays, placed)).transpose()?;
         if let Some(vessels) = &vessels {
             let there = if self.stage.vessels_in_background { 1.0 } else { 0.0 };
             add(&mut image, vessels, shot.contrast_gain as f32 - there);
@@ -360,9 +398,13 @@ impl<'a> Camera<'a> {
         Ok(Exposure { image, vessels })
     }
 
-    fn project(&self, view: usize, placed: &Placed) -> Result<Vec<f32>> {
-        let rays = std::slice::from_ref(&self.rays[view]);
-        Ok(self.projector.project(&placed.volume, rays, placed.shift_mm)?.swap_remove(0))
+    fn project(&self, rays: &ViewRays, placed: &Placed) -> Result<Vec<f32>> {
+        Ok(self.projector.project(&placed.volume, std::slice::from_ref(rays), placed.shift_mm)?.swap_remove(0))
+    }
+
+    /// Static background through some rays.
+    pub(super) fn still_through(&self, still: Option<&Placed>, rays: &ViewRays) -> Result<Vec<f32>> {
+        still.map_or_else(|| Ok(vec![0.0; self.still[0].len()]), |placed| self.project(rays, placed))
     }
 
     /// Mask of vessel pixels, from the line integrals of vessels alone.

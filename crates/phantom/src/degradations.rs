@@ -172,6 +172,7 @@ pub(super) enum Draw {
     Contrast,
     ContrastCourse,
     Blade,
+    Panning,
 }
 
 /// Random numbers of one training view. Each [`Draw`] has its own numbers, so that one degradation does not change another.

@@ -2,6 +2,7 @@
 
 use nertca_vk::{choice, error, files, formats, geometry, gpu, kernels, random, raster, scan};
 
+pub mod acquisition;
 mod blades;
 mod catheter;
 pub mod dataset;

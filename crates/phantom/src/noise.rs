@@ -17,6 +17,14 @@ pub enum Photons {
 }
 
 impl Photons {
+    /// Returns a dose that is larger by a factor.
+    pub fn scaled(self, factor: f64) -> Photons {
+        match self {
+            Photons::Unattenuated(photons) => Photons::Unattenuated(factor * photons),
+            Photons::Detector(photons) => Photons::Detector(factor * photons),
+        }
+    }
+
     /// Photons per pixel of the unattenuated beam, for an image of line integrals.
     pub fn unattenuated(self, image: &[f32]) -> f64 {
         match self {

@@ -7,13 +7,13 @@ use crate::voxels::Breath;
 use glam::DVec3;
 
 /// Length of a beat without a stated heart rate, seconds; phases divide it equally.
-const USUAL_BEAT_S: f64 = 1.0;
+pub(super) const USUAL_BEAT_S: f64 = 1.0;
 /// Displacement of the heart during expiration, per mm along the body, LPS: up and back. Shechter et al., "Respiratory motion
 /// of the heart from free breathing coronary angiograms", IEEE Trans. Med. Imaging 23:1046 (2004): 4.9 mm down and 1.3 mm to
 /// the front during inspiration.
 const BREATH: DVec3 = DVec3::new(0.0, 1.3 / 4.9, 1.0);
 /// End of systole after the R-peak, seconds, with its range between runs: the time of rest that Shechter and others find.
-const SYSTOLE_S: std::ops::Range<f64> = 0.28..0.34;
+pub(super) const SYSTOLE_S: std::ops::Range<f64> = 0.28..0.34;
 /// Period of the variation of contrast within a run, seconds.
 const CONTRAST_WAVE_S: f64 = 3.0;
 /// Variation of contrast within a run as a share of its variation between runs.
@@ -96,7 +96,7 @@ fn gated(rhythm: &Rhythm, chance: Chance, phases: u32) -> Vec<Option<Shot>> {
 
 impl Breathing {
     /// Displacement by breathing at a time of a run; each run begins at a random point of the breath.
-    fn at(self, time_s: f64, chance: Chance) -> Breath {
+    pub(super) fn at(self, time_s: f64, chance: Chance) -> Breath {
         let course = chance.uniform(Draw::Breath) + time_s / self.period_s;
         let heart_mm = BREATH * (0.5 * self.peak_to_peak_mm * (std::f64::consts::TAU * course).sin());
         Breath { heart_mm, chest_mm: if self.background { heart_mm } else { DVec3::ZERO } }
@@ -104,7 +104,7 @@ impl Breathing {
 }
 
 /// Factor on the contrast of a run, with its slow variation over time.
-fn contrast_gain(variation: f64, time_s: f64, chance: Chance) -> f64 {
+pub(super) fn contrast_gain(variation: f64, time_s: f64, chance: Chance) -> f64 {
     let course = chance.uniform(Draw::ContrastCourse) + time_s / CONTRAST_WAVE_S;
     let wave = std::f64::consts::SQRT_2 * (std::f64::consts::TAU * course).sin();
     let gain = 1.0 + variation * (chance.normal(Draw::Contrast) + CONTRAST_WITHIN * wave);

@@ -9,7 +9,7 @@ use crate::calibrate::adjustment::{Adjusted, Adjustment};
 use crate::calibrate::observed::coarsened_for_calibration;
 use crate::calibrate::pose::{Poses, ViewPose};
 use crate::calibrate::settings::CalibrateMode;
-use crate::config::sections::{GaussiansSettings, Rule};
+use crate::config::sections::GaussiansSettings;
 use crate::config::{AdjustMode, GaussianForm};
 use crate::error::{Error, Result};
 use crate::evidence::ratios::ViewEvidence;
@@ -69,9 +69,6 @@ const SMALL_MISFIT: f64 = 0.12;
 const MANY_VIEWS: f64 = 4.0;
 /// Misfit from which on noise outweighs the vessels. Wrong poses of three views leave up to 1.0, 2e4 photons with right poses 0.9.
 const LARGE_MISFIT: f64 = 1.5;
-/// Share of the misfit that an accepted adjustment leaves at most. Of the data sets of `studies/degradations.toml`, those with a share of 0.80 or
-/// less gain up to 0.28 of Dice and lose at most 0.005; those with 0.84 or more lose up to 0.02 with three views.
-const ACCEPTED: f64 = 0.82;
 /// Difference of the seeds of one fit and the next.
 const NEXT_SEED: u32 = 10;
 
@@ -152,14 +149,9 @@ impl Adjuster<'_> {
         let Some(poses) = self.found(start, observe)? else { return Ok(None) };
         let nearly = f64::from(N_CYCLES + 1) / f64::from(N_CYCLES + 2);
         match self.compared(&self.as_in_a_run(&poses)?, &mut || observe(nearly))? {
-            Some((after, adjusted)) if after <= self.accepted() * before => outcome(poses, true, Some(after), adjusted),
+            Some((after, adjusted)) if after <= before => outcome(poses, true, Some(after), adjusted),
             after => outcome(poses, false, after.map(|(after, _)| after), made),
         }
-    }
-
-    /// Returns the largest share of the misfit that an accepted adjustment leaves.
-    fn accepted(&self) -> f64 {
-        if self.config.gaussians.left_out.keeps(Rule::Acceptance) { ACCEPTED } else { 1.0 }
     }
 
     /// Finds poses in cycles of a fit and a step of the poses.

@@ -16,18 +16,25 @@ pub(super) fn gaussian(sigma: f32) -> Vec<f32> {
 
 /// Correlates rows and columns with `kernel` (odd length); outside, the border's pixels are continued.
 pub(super) fn separable(image: &Image, kernel: &[f32]) -> Image {
+    rows_and_columns(image, kernel, kernel)
+}
+
+/// Correlates rows with one kernel and columns with another one, both of the same odd length, as [`separable`] does.
+pub(super) fn rows_and_columns(image: &Image, of_rows: &[f32], of_columns: &[f32]) -> Image {
     let (w, h) = (image.width, image.height);
-    let radius = kernel.len() / 2;
+    let radius = of_rows.len() / 2;
     let at = |centre: usize, k: usize, end: usize| (centre + k).saturating_sub(radius).min(end - 1);
     let mut rows = Image::zeros(w, h);
+    let mut continued = vec![0f32; w + 2 * radius];
     for (source, row) in image.values.chunks(w).zip(rows.values.chunks_mut(w)) {
-        for (x, out) in row.iter_mut().enumerate() {
-            *out = kernel.iter().enumerate().map(|(k, weight)| weight * source[at(x, k, w)]).sum();
+        continued.iter_mut().enumerate().for_each(|(x, value)| *value = source[at(x, 0, w)]);
+        for (k, weight) in of_rows.iter().enumerate() {
+            row.iter_mut().zip(&continued[k..]).for_each(|(out, v)| *out += weight * v);
         }
     }
     let mut out = Image::zeros(w, h);
     for (y, row) in out.values.chunks_mut(w).enumerate() {
-        for (k, weight) in kernel.iter().enumerate() {
+        for (k, weight) in of_columns.iter().enumerate() {
             let source = &rows.values[at(y, k, h) * w..][..w];
             row.iter_mut().zip(source).for_each(|(out, v)| *out += weight * v);
         }

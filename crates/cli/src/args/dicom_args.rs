@@ -31,9 +31,9 @@ pub struct RunArgs {
     /// Heart rate, beats per minute, of a regular rhythm with an R-peak at the first frame: one for all runs, or one for each.
     #[arg(long, value_name = "PER_MIN[,PER_MIN...]", value_delimiter = ',', conflicts_with = "phase_list")]
     pub heart_rate: Vec<f64>,
-    /// Find the beat of each run from the motion of its vessels, without an ECG. A regular rhythm is assumed; at least
-    /// one and a half beats must be filled with contrast.
-    #[arg(long, conflicts_with_all = ["still", "r_peaks", "heart_rate", "phase_list"])]
+    /// Find the beat of each run in its images, without an ECG, and take the vessels of single frames from a background that may move. Runs
+    /// are aligned with each other. A regular rhythm is assumed, over at least one and a quarter beats.
+    #[arg(long, conflicts_with_all = ["still", "r_peaks", "heart_rate", "phase_list", "all_beats", "beat_scaling"])]
     pub gate_by_images: bool,
     /// Average the frames of a phase over all beats of a run. By default, each phase is taken from one beat, that with most
     /// contrast and least change by breathing, because vessels of two breaths do not coincide.

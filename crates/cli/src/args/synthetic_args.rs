@@ -73,6 +73,19 @@ pub struct PhantomArgs {
     /// times; `truth.json` has the lesions.
     #[arg(long, value_name = "BRANCH,POSITION,DIAMETER%,LENGTH", value_parser = stenosis)]
     pub stenosis: Vec<Stenosis>,
+    /// Write each training view also as a run without ECG, as a cath lab makes it, into this directory: a DICOM file, a folder of pictures,
+    /// and `truth.json`. Contrast agent arrives and leaves, and degradations act on the runs; the dataset is then what is true.
+    #[arg(long, value_name = "DIR")]
+    pub runs: Option<PathBuf>,
+    /// Frames of each run.
+    #[arg(long, value_name = "N", default_value_t = 45, requires = "runs")]
+    pub run_frames: u32,
+    /// Panning of the table within each run, mm along the patient.
+    #[arg(long, value_name = "MM", default_value_t = 0.0, requires = "runs")]
+    pub panning: f64,
+    /// Bits of a pixel of the runs.
+    #[arg(long, default_value_t = 12, requires = "runs")]
+    pub bits: u32,
     /// Degradations that occur in a cath lab.
     #[command(flatten)]
     pub degradations: DegradationArgs,

@@ -13,7 +13,8 @@ use nertca_vk::formats::volume::VolumeHints;
 use nertca_vk::scan::dataset::Layout;
 use nertca_vk_import::angiograms::ImportOptions;
 use nertca_vk_import::intake::import_dicom_as_stated;
-use nertca_vk_phantom::dataset::{Anatomy, PhantomOptions, VolumeOptions, make, project_volumes};
+use nertca_vk_phantom::acquisition::Acquisition;
+use nertca_vk_phantom::dataset::{Anatomy, PhantomOptions, VolumeOptions, make_with_runs, project_volumes};
 use nertca_vk_phantom::degradations::Degradations;
 use std::path::{Path, PathBuf};
 
@@ -107,8 +108,14 @@ pub fn phantom(global: &GlobalOptions, args: &PhantomArgs) -> Result<()> {
         }),
         volumes_every: (!args.no_volumes).then_some(args.volumes_every),
     };
+    let runs = args.runs.as_ref().map(|directory| Acquisition {
+        directory: directory.clone(),
+        frames: args.run_frames,
+        panning_mm: args.panning,
+        bits: args.bits,
+    });
     tell_of_times(options.layout, &options.degradations);
-    warn(&write_dataset(&args.out, args.force, |out| make(&gpu, &options, out, bar()))?);
+    warn(&write_dataset(&args.out, args.force, |out| make_with_runs(&gpu, &options, runs.as_ref(), out, bar()))?);
     out!("{}", args.out.display());
     global.close_device(&gpu)
 }
