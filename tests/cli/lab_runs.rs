@@ -11,6 +11,8 @@ use std::process::Output;
 const RATES: [f64; 3] = [70.0, 82.0, 65.0];
 /// Cardiac phases.
 const PHASES: f64 = 10.0;
+/// Minimum share of the way to the ends of the vessels that contrast agent has reached in a frame that is used.
+const LEAST_FILLED: f64 = 0.6;
 /// Minimum mean Dice of unseen views.
 const LEAST_DICE: f64 = 0.5;
 
@@ -78,7 +80,7 @@ fn runs_of_a_lab_become_a_tree() {
         &[
             &["phantom", text(&exact), "--tree", text(&tree), "--background", text(&thorax), "--fov", "120"][..],
             &["--views", "3", "--size", "128", "--no-volumes", "--test-angles=-5,40", "--photons", "1e6"],
-            &["--runs", text(&runs), "--run-frames", "36", "--panning", "6", "--breathing", "2", "--inflow", "0.4"],
+            &["--runs", text(&runs), "--panning", "6", "--breathing", "2", "--inflow", "0.4"],
             &["--heart-rate", &rates, "--geometry-error", "0.3,0"],
         ]
         .concat(),
@@ -102,7 +104,8 @@ fn runs_of_a_lab_become_a_tree() {
         let view = image["run"].as_u64().unwrap();
         let number = image["frames"][0].as_u64().unwrap() as usize - 1;
         let taken = of_view(&truth, view as usize)[number];
-        assert_eq!(taken["filled_to"].as_f64(), Some(1.0), "frame {number} of view {view}: {said}");
+        let filled = taken["filled_to"].as_f64().unwrap();
+        assert!(filled >= LEAST_FILLED, "frame {number} of view {view} is filled to {filled}: {said}");
         let frames = manifest["frames"].as_array().unwrap();
         let stated = frames.iter().find(|frame| frame["image"] == image["image"]).unwrap();
         errors.push((view, apart(taken["beat_phase"].as_f64().unwrap(), stated["phase"].as_f64().unwrap())));

@@ -88,7 +88,9 @@ fn a_run_without_ecg_is_gated_by_its_images() {
     let swing = |frame: u32| 8.0 * (std::f64::consts::TAU * f64::from(frame) / 12.0).sin();
     let pixel = |frame: u32, p: u32| {
         let bar = (f64::from(p % 64) - 32.0 - swing(frame)).abs() < 1.5 && (10..54).contains(&(p / 64));
-        if bar && frame > 5 { 90u8 } else { 190 + (p / 64 / 8) as u8 }
+        let (x, y) = (f64::from(p % 64), f64::from(p / 64));
+        let chest = 185.0 + 9.0 * (0.55 * x + 0.35 * y).sin() + 7.0 * (0.8 * y - 0.3 * x).sin();
+        if bar && frame > 5 { 90u8 } else { chest as u8 }
     };
     let pixels: Vec<u8> = (0..frames).flat_map(|f| (0..64 * 64).map(move |p| pixel(f, p))).collect();
     dicom::angiogram(&file, |o| {

@@ -20,7 +20,7 @@ const NEAR_MM: f64 = 4.0;
 const BASE: f64 = 0.1;
 /// Percentile over the pixels of the contrast beyond that base that stands for a frame.
 const CONTRAST: f64 = 0.98;
-/// The same percentile of noise alone, in its standard deviations.
+/// Value of noise alone at this percentile, in its standard deviations.
 const CONTRAST_OF_NOISE: f32 = 2.05;
 /// Percentile over the frames of the contrast that counts as 1.
 const FULLEST: f64 = 0.95;
@@ -33,7 +33,7 @@ const TRAVEL: f64 = 0.05;
 /// Contrast of the emptiest frame of a beat below which the beat is penalised, and the penalty.
 const EMPTIEST: [f64; 2] = [0.5, 0.3];
 
-/// What the images of a run show.
+/// Analysis of the images of a run.
 pub struct Cine {
     /// Displacement (columns, rows) of each frame that brings its background to that of the others, pixels.
     pub displacements: Vec<[f32; 2]>,

@@ -8,7 +8,7 @@ use crate::scan::at_rest::{WIDEST_VESSEL_MM, vessel_pixels, without_vessels};
 use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
 use crate::scan::references::ReferencedRun;
 use crate::stands::stands;
-use crate::ungated::{OneBeat, Placed};
+use crate::ungated::{BeatImage, OneBeat, Placed};
 use crate::{beats, ungated};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
@@ -19,7 +19,9 @@ const FILLED_SHARE: f64 = 0.6;
 /// Line integral that corresponds to the full range of display grey values.
 const DISPLAY_SPAN: f64 = 3.0;
 /// Line integral from which an area belongs to the collimator or the detector's rim.
-pub(super) const DARK: f32 = (0.85 * DISPLAY_SPAN) as f32;
+const DARK: f32 = (0.85 * DISPLAY_SPAN) as f32;
+/// Line integral behind a blade where pixels are linear in intensity: half a percent of the full range.
+const DARK_LINEAR: f32 = 5.3;
 
 /// Source of the phases.
 #[derive(Debug, Clone)]
@@ -168,8 +170,10 @@ impl Prepared {
             }
         };
         if options.is_ungated() {
-            let beat = OneBeat::of(run, &frames, &c_arms, at_isocentre, options, &mut notes)?;
-            let frames = beat.frames(&Placed::default(), options.phases);
+            let dark = if run.relationship == Relationship::Linear { DARK_LINEAR } else { DARK };
+            let asked = options.frames.as_ref();
+            let beat = OneBeat::of(run, &frames, &c_arms, at_isocentre, asked, dark, &mut notes)?;
+            let frames = frames_of(&beat, &Placed::default(), options.phases);
             return Ok(Prepared { frames, reference: referenced(beat.first)?, beat: Some(beat), notes });
         }
         let stands = stands(&c_arms, [width, height]);
@@ -198,6 +202,18 @@ impl Prepared {
             notes,
         })
     }
+}
+
+/// Images of a run without ECG at its place.
+pub(super) fn frames_of(beat: &OneBeat, placed: &Placed, phases: u32) -> Vec<TakenFrame> {
+    let c_arm = beat.c_arm(placed);
+    let taken = |BeatImage { taken, frame, image }: BeatImage| TakenFrame {
+        c_arm: c_arm.clone(),
+        taken,
+        image,
+        frames: vec![frame],
+    };
+    beat.images(placed, phases).into_iter().map(taken).collect()
 }
 
 /// Image of a phase.

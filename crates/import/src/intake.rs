@@ -1,6 +1,6 @@
 //! Accepts runs, together or one after the other, and checks them against each other.
 
-use crate::angiograms::{Gating, ImportOptions, Prepared, TakenFrame};
+use crate::angiograms::{Gating, ImportOptions, Prepared, TakenFrame, frames_of};
 use crate::dicom::Run;
 use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT};
@@ -154,7 +154,7 @@ impl Intake {
         let phases = self.options.phases;
         let placed_runs = self.runs.iter_mut().filter(|run| run.beat.is_some()).zip(placed);
         for (run, placed) in placed_runs {
-            run.frames = run.beat.as_ref().map(|beat| beat.frames(&placed, phases)).unwrap_or_default();
+            run.frames = run.beat.as_ref().map(|beat| frames_of(beat, &placed, phases)).unwrap_or_default();
         }
         notes
     }

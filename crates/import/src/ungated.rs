@@ -1,7 +1,6 @@
 //! Runs without ECG: the beat of each run that is used, and its place in the common beat and in the room.
 
-use crate::angiograms::{DARK, ImportOptions, TakenFrame};
-use crate::dicom::{Relationship, Run};
+use crate::dicom::Run;
 use crate::error::{Error, Result};
 use crate::geometry::{CArm, Geometry, ViewRays, lps_mm_from_world};
 use crate::raster::{Image, median};
@@ -9,14 +8,12 @@ use crate::scan::gating::BeatTime;
 use glam::DVec3;
 use nertca_vk_angiograms::calibrate::runs::{Aligned, Beating, PairAgreement, STEPS, align};
 use nertca_vk_angiograms::cine::Cine;
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
 /// Shorter side of the images in which vessels are found, pixels: about 0.4 mm per pixel at the isocentre.
 pub(super) const SIDE: usize = 256;
 /// Largest accepted number of frames of a run: 20 s at 15 per second.
 const MAX_FRAMES: usize = 300;
-/// Line integral behind a blade where pixels are linear in intensity: half a percent of the full range.
-const DARK_LINEAR: f32 = 5.3;
 /// Bound of line integrals of vessels, in units of their median: where vessels overlap, and in the catheter, values say less of how much there
 /// is than of where.
 const SATURATION: f32 = 2.0;
@@ -45,8 +42,19 @@ pub(super) struct OneBeat {
     vessels: Vec<Image>,
 }
 
+/// Vessels of a frame of a beat.
+pub(super) struct BeatImage {
+    /// Time in the common beat.
+    pub(super) taken: BeatTime,
+    /// Frame of the run, from 0.
+    pub(super) frame: usize,
+    /// Line integrals of the vessels.
+    pub(super) image: Image,
+}
+
 impl OneBeat {
-    /// Finds the beat of a run to use, and the vessels of its frames. `mm` is the size of a pixel at the isocentre.
+    /// Finds the beat of a run to use, within the frames that were `asked` for (from 1), and the vessels of its frames. `mm` is the size of a
+    /// pixel at the isocentre, `dark` the line integral from which a pixel may show a blade.
     ///
     /// # Errors
     /// [`Error::Data`] for a run whose frames do not repeat; [`Error::Config`] for options that do not fit the run.
@@ -55,13 +63,14 @@ impl OneBeat {
         frames: &[Image],
         c_arms: &[CArm],
         mm: f64,
-        options: &ImportOptions,
+        asked: Option<&RangeInclusive<usize>>,
+        dark: f32,
         notes: &mut Vec<String>,
     ) -> Result<OneBeat> {
         let refused = |problem: String| Error::data(&run.path, "phases", problem);
         let n = frames.len();
         let name = run.name();
-        let within = match &options.frames {
+        let within = match asked {
             None => 0..n,
             Some(asked) if *asked.start() > 0 && *asked.end() <= n && !asked.is_empty() => {
                 asked.start() - 1..*asked.end()
@@ -91,7 +100,7 @@ impl OneBeat {
                 "{n} frames are given, of which all pairs are compared: at most {MAX_FRAMES} are accepted"
             )));
         }
-        let found = Cine::new(frames, 1.0 / frame_s, dark(run.relationship), mm);
+        let found = Cine::new(frames, 1.0 / frame_s, dark, mm);
         let Some(rhythm) = found.rhythm else {
             return Err(refused(format!(
                 "the {n} frames in {:.1} s do not repeat, as they would in one and a quarter beats of a regular rhythm: {other}",
@@ -132,8 +141,14 @@ impl OneBeat {
         Ok(OneBeat { c_arm, rays, first, frames: beat, length: rhythm.frames, vessels })
     }
 
+    /// C-arm of all images of a run at its place.
+    pub(super) fn c_arm(&self, placed: &Placed) -> CArm {
+        let sum: DVec3 = DVec3::from_array(self.c_arm.table_mm) + placed.table_mm;
+        CArm { table_mm: sum.to_array(), ..self.c_arm.clone() }
+    }
+
     /// Images at whole phases of the common beat, each the frame nearest to its phase.
-    pub(super) fn frames(&self, placed: &Placed, n_phases: u32) -> Vec<TakenFrame> {
+    pub(super) fn images(&self, placed: &Placed, n_phases: u32) -> Vec<BeatImage> {
         let n = f64::from(n_phases);
         let start = n * placed.first_step as f64 / STEPS as f64;
         let mut nearest: Vec<Option<(BeatTime, usize)>> = vec![None; n_phases as usize];
@@ -144,14 +159,11 @@ impl OneBeat {
                 *slot = Some((taken, frame));
             }
         }
-        let sum: DVec3 = DVec3::from_array(self.c_arm.table_mm) + placed.table_mm;
-        let c_arm = CArm { table_mm: sum.to_array(), ..self.c_arm.clone() };
         let bound = bound(&self.vessels);
-        let image = |(taken, frame): (BeatTime, usize)| TakenFrame {
-            c_arm: c_arm.clone(),
+        let image = |(taken, frame): (BeatTime, usize)| BeatImage {
             taken,
+            frame: self.frames.start + frame,
             image: saturated(&self.vessels[frame], bound),
-            frames: vec![self.frames.start + frame],
         };
         nearest.into_iter().flatten().map(image).collect()
     }
@@ -182,14 +194,6 @@ pub(super) fn place(runs: &[&OneBeat], names: &[String]) -> (Vec<Placed>, Vec<St
         )
     };
     ((0..runs.len()).map(placed).collect(), pairs.iter().map(note).collect())
-}
-
-/// Line integral from which a pixel may show a blade.
-fn dark(relationship: Relationship) -> f32 {
-    match relationship {
-        Relationship::Linear => DARK_LINEAR,
-        Relationship::Log | Relationship::Display => DARK,
-    }
 }
 
 /// C-arm of a part of an image.

@@ -1,7 +1,7 @@
 //! Runs as a cath lab makes them: frames of several beats, in which contrast agent arrives and leaves, the table is panned, and the tube needs
 //! some frames to reach its dose. They have no ECG. Each run is written as a DICOM file and as a folder of pictures.
 
-use crate::dataset::{Camera, Exposure, Shooting, Stage};
+use crate::camera::{Camera, Exposure, Shooting, Stage};
 use crate::degradations::{Chance, Degradations, Draw, USUAL_FRAMES_PER_S};
 use crate::error::{Error, Result};
 use crate::formats::png;

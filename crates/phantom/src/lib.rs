@@ -4,6 +4,7 @@ use nertca_vk::{choice, error, files, formats, geometry, gpu, kernels, random, r
 
 pub mod acquisition;
 mod blades;
+mod camera;
 mod catheter;
 pub mod dataset;
 pub mod degradations;

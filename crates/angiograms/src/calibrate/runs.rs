@@ -52,7 +52,7 @@ pub struct PairAgreement {
     pub runs: [usize; 2],
     /// Correlation of their profiles at the stated geometry.
     pub stated: f64,
-    /// The same with the displacements of the runs.
+    /// Correlation of their profiles with the displacements of the runs.
     pub aligned: f64,
     /// Displacement between the runs along the normal of their planes, mm.
     pub displaced_mm: f64,

@@ -12,6 +12,9 @@ const BAND_MM: [f64; 2] = [0.65, 5.2];
 const CUT: f32 = 1.5;
 /// Furthest displacement of a frame from its neighbour, and from an earlier estimate, mm.
 const REACH_MM: f64 = 10.0;
+/// Correlation that a displacement by one pixel must gain, times the square of its length in pixels: where there is no texture, frames stay where
+/// they are.
+const NEARER: f32 = 1e-5;
 /// Reduction of the images in which displacements are searched over the whole reach; the rest of the search is this far around the best one.
 const REDUCTION: usize = 2;
 /// Rounds of comparison with the median of the moved frames.
@@ -70,7 +73,9 @@ impl Weighted {
     fn best(&self, moved: &Weighted, centre: [i32; 2], reach: i32) -> [f32; 2] {
         let side = 2 * reach + 1;
         let at = |k: i32| [centre[0] + k % side - reach, centre[1] + k / side - reach];
-        let rated: Vec<f32> = (0..side * side).map(|k| self.correlation(moved, at(k))).collect();
+        let far = |k: i32| (k % side - reach).pow(2) + (k / side - reach).pow(2);
+        let rate = |k: i32| self.correlation(moved, at(k)) - NEARER * far(k) as f32;
+        let rated: Vec<f32> = (0..side * side).map(rate).collect();
         let best =
             (0..side * side).max_by(|a, b| rated[*a as usize].total_cmp(&rated[*b as usize])).unwrap_or_default();
         let [x, y] = at(best);

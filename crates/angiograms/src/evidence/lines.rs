@@ -29,7 +29,7 @@ const NOISE_PERCENTILE: f64 = 0.8;
 const NEIGHBOURHOOD_MM: f64 = 5.0;
 /// Response of the line filter from which a line is certain, in units of that noise.
 const CERTAIN: f32 = 3.0;
-/// The same, as a share of the response of the most contrasted half percent of the pixels of filled frames.
+/// Least such response, as a share of the response of the most contrasted half percent of the pixels of filled frames.
 const CERTAIN_SHARE: f32 = 0.15;
 /// Response at which a line ends, as a share of that at which it is certain.
 const ENDS: f32 = 0.5;
