@@ -118,7 +118,8 @@ fn near(displacements: &[[f32; 2]], mm: f64) -> Vec<usize> {
 fn shown(frames: &[Image], dark: f32) -> Vec<bool> {
     let usual = over_frames(frames.iter(), 0.5);
     let (width, height) = (usual.width, usual.height);
-    let is_border = |p: usize| p % width == 0 || p % width == width - 1 || p / width == 0 || p / width == height - 1;
+    let is_end = |at: usize, n: usize| at == 0 || at + 1 == n;
+    let is_border = |p: usize| is_end(p % width, width) || is_end(p / width, height);
     let mut blade = vec![false; width * height];
     let mut next: Vec<usize> = (0..blade.len()).filter(|p| is_border(*p) && usual.values[*p] > dark).collect();
     next.iter().for_each(|p| blade[*p] = true);

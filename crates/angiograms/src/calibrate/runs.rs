@@ -260,7 +260,7 @@ fn best_first_step(run: usize, pairs: &[Pair], first_step: &[usize]) -> usize {
 
 /// Displacements of all runs, mm, world axes: those at which the pairs together correlate best.
 fn displacements(n: usize, pairs: &[Pair], means: &[Curve]) -> Vec<DVec3> {
-    let peaks: Vec<Peak> = means.iter().map(|curve| Peak::of(curve)).collect();
+    let peaks: Vec<Peak> = means.iter().map(Peak::of).collect();
     let wanted: Vec<f64> = peaks.iter().map(|peak| peak.mm).collect();
     let weights: Vec<f64> = peaks.iter().map(|peak| peak.lead).collect();
     if pairs.len() < 2 {
