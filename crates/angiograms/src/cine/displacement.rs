@@ -254,3 +254,24 @@ pub(super) fn shown_by_all(shown: &[bool], [width, height]: [usize; 2], places: 
     }
     all
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_image_moves_by_its_displacement() {
+        let (width, height) = (9, 7);
+        let mut image = Image::zeros(width, height);
+        image.values[3 * width + 4] = 1.0;
+        let at = |image: &Image, x: usize, y: usize| image.values[y * width + x];
+        let whole = moved(&image, [2.0, -1.0]);
+        assert_eq!((at(&whole, 6, 2), whole.values.iter().sum::<f32>()), (1.0, 1.0));
+        let half = moved(&image, [-0.5, 0.0]);
+        assert_eq!([3, 4, 5].map(|x| at(&half, x, 3)), [0.5, 0.5, 0.0]);
+        let shown = vec![true; width * height];
+        let all = shown_by_all(&shown, [width, height], &[[2.0, 0.0], [0.0, -1.0]]);
+        let marked: Vec<usize> = (0..all.len()).filter(|p| all[*p]).collect();
+        assert_eq!((marked[0], marked[marked.len() - 1], marked.len()), (2, 5 * width + 8, 7 * 6));
+    }
+}
