@@ -56,6 +56,10 @@ impl Weighted {
     fn correlation(&self, moved: &Weighted, [dx, dy]: [i32; 2]) -> f32 {
         let overlap = |d: i32, n: usize| (d.max(0) as usize, n.saturating_sub(d.unsigned_abs() as usize));
         let ((x, columns), (y, rows)) = (overlap(dx, self.width), overlap(dy, self.height));
+        // Steps from frame to frame may add up to more than a small image.
+        if columns == 0 || rows == 0 {
+            return 0.0;
+        }
         let mut sums = [0f32; 3];
         for row in 0..rows {
             let here = (y + row) * self.width + x;
@@ -258,6 +262,17 @@ pub(super) fn shown_by_all(shown: &[bool], [width, height]: [usize; 2], places: 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn images_without_a_common_pixel_are_not_alike() {
+        let [width, height] = [9, 7];
+        let image = Image { width, height, values: vec![1.0; width * height] };
+        let weighted = Weighted::new(&image, &vec![1.0; width * height]);
+        for displacement in [[9, 0], [-40, 2], [3, 7], [2, -30], [60, -60]] {
+            assert_eq!(weighted.correlation(&weighted, displacement), 0.0, "{displacement:?}");
+        }
+        assert!((weighted.correlation(&weighted, [8, -6]) - 1.0).abs() < 1e-6);
+    }
 
     #[test]
     fn an_image_moves_by_its_displacement() {
