@@ -34,9 +34,9 @@ fn phantom(data: &Path, imperfection: &[&str]) {
     nertca(&[&plain, imperfection].concat());
 }
 
-/// Mean Dice at unseen views.
+/// Mean Dice at unseen views, of Gaussians that are fitted to their end.
 fn trained_dice(data: &Path, run: &Path) -> f64 {
-    nertca(&["train", text(data), "--out", text(run)]);
+    nertca(&["train", text(data), "--out", text(run), "--stop-at", "130"]);
     read(&run.join("report/evaluation.json"))["dice"]["dynamic"].as_f64().unwrap()
 }
 
@@ -63,34 +63,6 @@ fn imperfect_angiograms_cost_little() {
         perfect - own_time < LOSS_OF_UNEQUAL_BEATS,
         "unequal beats: {own_time} where perfect angiograms give {perfect}"
     );
-}
-
-/// With all moderate imperfections and three views, blades leave two views for much of the chest. Dice is .83; with the broad Gaussians that
-/// explain these two views it was .60.
-#[test]
-#[ignore = "long: tools/test --all"]
-fn a_haze_behind_blades_is_no_vessel() {
-    let Some(anatomy) = shared::shared("anatomy") else { return };
-    let (tree, ct) = (anatomy.join("coronary_tree_hra.json"), anatomy.join("thorax_ct.nii.gz"));
-    let directory = tempfile::tempdir().unwrap();
-    let [data, run] = ["data", "run"].map(|name| directory.path().join(name));
-    let real = ["--tree", text(&tree), "--background", text(&ct), "--views", "3", "--seed", "4", "--no-volumes"];
-    let unseen = ["--test-angles=-5,40;90,0"];
-    let moderate = ["--geometry-error", "0.5,2", "--breathing", "3", "--photons", "1e5", "--contrast-variation", "20"];
-    let frames = ["--heart-rate", "70,80,65", "--fps", "15", "--collimate", "0.1"];
-    nertca(&[&["phantom", text(&data)], &real[..], &unseen, &moderate, &frames].concat());
-    let trained =
-        program().args(["train", text(&data), "-o", text(&run), "--seed", "4", "--stop-at", "130"]).output().unwrap();
-    let told = String::from_utf8_lossy(&trained.stderr);
-    assert!(trained.status.success(), "{told}");
-    let left_out = "fit 1 of 3: Gaussians that are left out, because they are broader than the vessels and hidden";
-    assert!(told.contains(left_out), "{told}");
-    // Not only one fit's findings are stated, be it the first or the last one.
-    let stated = (1..=3).filter(|fit| told.contains(&format!("fit {fit} of 3: "))).count();
-    assert!(stated > 1, "{told}");
-    let dice = read(&run.join("report/evaluation.json"))["dice"]["dynamic"].as_f64().unwrap();
-    println!("Dice {dice:.3}");
-    assert!(dice > 0.74, "{dice}");
 }
 
 /// A catheter that all training views show, and no unseen view: Dice is .84 with it and .95 without it.

@@ -38,7 +38,7 @@ fn a_tree_rests_where_vessels_are_full() {
     assert!(notes.iter().any(|note| note.contains(&format!("from phase {rest},"))), "{notes:?}");
 
     let finished = directory.path().join("run");
-    let said = run(&["train", text(&data), "-o", text(&finished), "--preset", "fast"], true);
+    let said = run(&["train", text(&data), "-o", text(&finished), "--preset", "fast", "--stop-at", "130"], true);
     assert!(said.contains(&format!("from phase {rest},")), "{said}");
     let dice = dice_by_phase(&finished);
     // Without fillings the mean of the phases before all is full is 0.5, and that of the others 0.88.
@@ -86,7 +86,7 @@ fn inflow_into_real_anatomy_costs_little_where_contrast_is() {
     let (data, finished) = (directory.path().join("data"), directory.path().join("run"));
     let real = ["--tree", text(&tree), "--background", text(&ct), "--inflow", "0.4", "--no-volumes"];
     run(&[&["phantom", text(&data)], &real[..]].concat(), true);
-    run(&["train", text(&data), "-o", text(&finished), "--preset", "fast"], true);
+    run(&["train", text(&data), "-o", text(&finished), "--preset", "fast", "--stop-at", "130"], true);
     let dice = dice_by_phase(&finished);
     assert!(mean(&dice) > 0.86 && mean(&dice[FULL_FROM..]) > 0.93, "{dice:?}");
 }

@@ -440,7 +440,7 @@ fn measurements_and_baked_views() {
     let directory = tempfile::tempdir().unwrap();
     let data = phantom(directory.path(), &[]);
     let run = directory.path().join("run");
-    ok(&[&["train", text(&data), "-o", text(&run)], SHORT].concat());
+    ok(&[&["train", text(&data), "-o", text(&run), "--no-eval"], SHORT].concat());
     let file = directory.path().join("bench.json");
     let quick = ["--preset", "fast-mlp", "--warm-up", "0", "--iterations", "2", "--repeats", "3"];
     let full = [
@@ -547,8 +547,9 @@ fn scoring_stops_when_told_and_can_be_left_for_later() {
     let data = directory.path().join("forty images");
     ok(&["phantom", text(&data), "--size", "64", "--phases", "10", "--views", "3", "--no-volumes"]);
     let run = directory.path().join("run");
-    // Forty images that take long to render.
+    // Forty images that take long to render, after a fit that does not.
     let slow = [SHORT, &["--set", "train.validate_every=0", "--set", "march.render_samples=1024"]].concat();
+    let slow = [&slow[..], &["--set", "calibrate.adjust=off", "--set", "gaussians.form=phase"]].concat();
     for name in ["-TERM", "-INT"] {
         let (mut child, mut lines) = training(&data, &run, &[&slow[..], &["--force"]].concat());
         assert!(lines.any(|line| line["event"] == "evaluation" && line["images"] == 1), "no image was scored");

@@ -123,7 +123,7 @@ fn runs_of_a_lab_become_a_tree() {
         assert!(off.abs() < 0.8, "run {other} is {off} phases apart: {said}");
     }
     add_unseen_views(&data, &exact, begins);
-    nertca(&["train", text(&data), "-o", text(&at("run"))]);
+    nertca(&["train", text(&data), "-o", text(&at("run")), "--stop-at", "130"]);
     let dice = read(&at("run").join("report/evaluation.json"))["dice"]["dynamic"].as_f64().unwrap();
     assert!(dice > LEAST_DICE, "Dice {dice}: {said}");
 }

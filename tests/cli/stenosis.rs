@@ -33,7 +33,7 @@ fn read(path: &Path) -> Value {
 /// Trains on a phantom with further options; returns its truth, its tree, and the words of the tree command.
 fn lesions_of(directory: &Path, more: &[&str]) -> (Value, Value, String) {
     let at = |name: &str| directory.join(name);
-    let size = ["--size", "80", "--phases", "6", "--volumes-every", "6"];
+    let size = ["--size", "80", "--phases", "6", "--volumes-every", "6", "--test-angles=-5,40"];
     ok(&[&["phantom", text(&at("data"))], &size[..], more].concat());
     ok(&["train", text(&at("data")), "-o", text(&at("run")), "--no-eval", "--stop-at", "130", "--tree"]);
     let said = ok(&["tree", text(&at("run")), "--phase", "0", "-o", text(&at("tree.json"))]);

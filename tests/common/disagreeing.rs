@@ -37,6 +37,7 @@ pub struct Wrong {
 }
 
 /// A dataset with stated geometry, and its true geometry.
+#[derive(Clone)]
 pub struct Shot {
     pub dataset: Dataset,
     /// True geometry of each view.

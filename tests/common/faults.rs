@@ -134,6 +134,8 @@ pub fn code(gpu: &Gpu, stage: &str, variant_asked: Option<&str>) -> Vec<u32> {
 
 /// Expects that nothing is found without a fault, and that each fault is found first in the row of its stage.
 pub fn expect_found(faults: &[Fault]) {
+    // Comparisons that found nothing without a fault.
+    let mut silent: Vec<Compare> = Vec::new();
     for Fault { stage, variant, plant, compare } in faults {
         shim::begin(shim::Failing::None);
         let open = || Gpu::open(&DeviceOptions { loader: Some(shim::loader()), ..DeviceOptions::default() }).unwrap();
@@ -145,7 +147,10 @@ pub fn expect_found(faults: &[Fault]) {
             assert!(found.is_some() || outcome.is_ok(), "{stage}: {outcome:?}");
             found
         };
-        assert_eq!(first_failure(), None, "without a fault");
+        if !silent.iter().any(|known| std::ptr::fn_addr_eq(*known, *compare)) {
+            assert_eq!(first_failure(), None, "without a fault");
+            silent.push(*compare);
+        }
         let words = code(&open(), stage, *variant);
         let mut faulty = words.clone();
         plant(&mut faulty);

@@ -82,8 +82,17 @@ pub fn expect_agreement(compare: impl FnOnce(&mut Findings) -> Result<()>) {
     assert!(!findings.rows().is_empty() && failed.is_empty(), "{}", failed.join("\n"));
 }
 
-/// The default procedural phantom without photon noise, with its vessel volumes.
+/// The default procedural phantom without photon noise.
 pub fn phantom(gpu: &Gpu, directory: &Path, size: usize, views: u32) -> Dataset {
+    phantom_with(gpu, directory, size, views, None)
+}
+
+/// The phantom of [`phantom`], with its vessel volumes.
+pub fn phantom_with_volumes(gpu: &Gpu, directory: &Path, size: usize, views: u32) -> Dataset {
+    phantom_with(gpu, directory, size, views, Some(NonZeroU32::MIN))
+}
+
+fn phantom_with(gpu: &Gpu, directory: &Path, size: usize, views: u32, volumes_every: Option<NonZeroU32>) -> Dataset {
     let options = PhantomOptions {
         setting: Setting::SmallXcat,
         size,
@@ -94,7 +103,7 @@ pub fn phantom(gpu: &Gpu, directory: &Path, size: usize, views: u32) -> Dataset 
         degradations: Degradations::default(),
         layout: Layout::Native,
         anatomy: None,
-        volumes_every: Some(NonZeroU32::MIN),
+        volumes_every,
     };
     make(gpu, &options, directory, |_, _, _| ()).unwrap();
     Dataset::open(directory).unwrap()

@@ -28,13 +28,25 @@ use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::train::trainer::Trainer;
 use nertca_vk_runs::session::{Progress, Session, SessionOptions, State};
 use nertca_vk_twins::reference::gaussians::{params, project};
-use std::sync::{Arc, Condvar, Mutex};
+use nertca_vk_twins::selftest::problems::with_values;
+use std::sync::{Arc, Condvar, Mutex, OnceLock};
 use std::time::Duration;
 
 const SIZE: usize = 64;
 
 fn fast() -> Config<GaussiansSettings> {
     Config::preset(Preset::Fast).of().unwrap()
+}
+
+/// A shot of three views that agree, made once.
+pub fn views_that_agree() -> &'static Shot {
+    static SHOT: OnceLock<Shot> = OnceLock::new();
+    SHOT.get_or_init(|| {
+        let gpu = gpu();
+        let shot = Studio::new(&gpu, SIZE, 1).shoot(3, Wrong::default());
+        expect_silence(gpu);
+        shot
+    })
 }
 
 /// A short fit to the stated geometry of a dataset.
@@ -93,9 +105,9 @@ fn norm(values: impl Iterator<Item = f64>) -> f64 {
 #[test]
 fn columns_are_derivatives_of_the_twin() {
     let gpu = gpu();
-    let dataset = Studio::new(&gpu, SIZE, 1).shoot(3, Wrong::default()).dataset;
-    let trainer = fitted(&gpu, &dataset);
-    let stands = Stands::new(&dataset, vec![0, 1, 2]);
+    let dataset = &views_that_agree().dataset;
+    let trainer = fitted(&gpu, dataset);
+    let stands = Stands::new(dataset, vec![0, 1, 2]);
     let field = FieldInLoop::new(&trainer, &stands);
     let deformable = trainer.deformable().unwrap();
     let poses = wrong_poses(3);
@@ -127,9 +139,9 @@ fn columns_are_derivatives_of_the_twin() {
 #[test]
 fn planted_errors_of_poses_and_contrasts_are_found() {
     let gpu = gpu();
-    let dataset = Studio::new(&gpu, SIZE, 1).shoot(3, Wrong::default()).dataset;
-    let trainer = fitted(&gpu, &dataset);
-    let stands = Stands::new(&dataset, vec![0, 1, 2]);
+    let dataset = &views_that_agree().dataset;
+    let trainer = fitted(&gpu, dataset);
+    let stands = Stands::new(dataset, vec![0, 1, 2]);
     let mut field = FieldInLoop::new(&trainer, &stands);
     let truth = wrong_poses(3);
     // Images that show the field at the true poses, in front of a flat background.
@@ -232,12 +244,15 @@ fn views_that_agree_are_not_adjusted() {
     assert!(trainer.preparation().is_some(), "the fit to other data is not taken over");
 }
 
-/// A session with the frames of a shot and default settings.
-pub fn session(gpu: &Gpu, shot: &Shot) -> Session {
-    session_with(gpu, shot, fast().into_any())
+/// Default settings, with few iterations of the static field after those of the Gaussians.
+fn brief() -> Config {
+    let mut config = fast();
+    config.train.iterations = config.gaussians.iterations + 10;
+    config.into_any()
 }
 
-fn session_with(gpu: &Gpu, shot: &Shot, config: Config) -> Session {
+/// A session with the frames of a shot.
+pub fn session_with(gpu: &Gpu, shot: &Shot, config: Config) -> Session {
     let dataset = &shot.dataset;
     let options = SessionOptions {
         config,
@@ -263,7 +278,7 @@ fn a_session_adjusts_its_views_when_training_has_ended_and_trains_on() {
         let contrast = if (frame.phase as usize + frame.view).is_multiple_of(2) { 1.15 } else { 0.85 };
         frame.integrals = frame.integrals.iter().map(|integral| contrast * integral).collect::<Vec<_>>().into();
     }
-    let session = session(&gpu, &shot);
+    let session = session_with(&gpu, &shot, brief());
     let steps = Arc::new(Mutex::new(Vec::new()));
     let seen = steps.clone();
     let observe = move |progress: &Progress| {
@@ -284,7 +299,7 @@ fn a_session_adjusts_its_views_when_training_has_ended_and_trains_on() {
     assert_eq!(steps.last(), Some(&session.step()));
     // The field that is shown belongs to the corrected views: their frames are taken in, and drawn where the frames show them.
     let model = session.checkpoint().unwrap().model;
-    assert_eq!(model.step, fast().train.iterations);
+    assert_eq!(model.step, brief().train.iterations);
     assert!(model.gaussians.as_ref().unwrap().rows().agreement.is_some(), "the mean of several fits");
     assert!(session.corrected_frame(0).unwrap().view.is_some());
     // Training that is started again has nothing left to do.
@@ -297,9 +312,8 @@ fn a_session_adjusts_its_views_when_training_has_ended_and_trains_on() {
 #[test]
 fn a_session_that_is_stopped_while_it_adjusts_keeps_its_reconstruction() {
     let gpu = gpu();
-    let shot = Studio::new(&gpu, SIZE, 1).shoot(3, Wrong { seed: 11, ..Wrong::default() });
-    let session = Arc::new(session(&gpu, &shot));
-    let end = fast().train.iterations;
+    let session = Arc::new(session_with(&gpu, views_that_agree(), brief()));
+    let end = brief().train.iterations;
     let reached = Arc::new((Mutex::new(false), Condvar::new()));
     let tell = reached.clone();
     let observe = move |progress: &Progress| {
@@ -333,8 +347,8 @@ fn short() -> Config {
     config.into_any()
 }
 
-fn of_two_views(gpu: &Gpu) -> Shot {
-    let mut shot = Studio::new(gpu, SIZE, 1).shoot(3, Wrong { seed: 11, ..Wrong::default() });
+fn of_two_views() -> Shot {
+    let mut shot = views_that_agree().clone();
     shot.dataset.frames.retain(|frame| frame.view < 2);
     shot.dataset.views.truncate(2);
     shot
@@ -343,7 +357,7 @@ fn of_two_views(gpu: &Gpu) -> Shot {
 #[test]
 fn a_session_ends_with_the_mean_of_fits_and_goes_on_from_a_single_one() {
     let gpu = gpu();
-    let shot = of_two_views(&gpu);
+    let shot = of_two_views();
     let gaussians = |session: &Session| session.checkpoint().unwrap().model.gaussians.unwrap();
     let single = session_with(&gpu, &shot, short());
     single.train(u32::MAX, &mut |_| true).unwrap();
@@ -374,8 +388,9 @@ fn a_session_ends_with_the_mean_of_fits_and_goes_on_from_a_single_one() {
 #[test]
 fn an_earlier_field_is_shown_until_the_first_of_several_fits_is_done() {
     let gpu = gpu();
-    let shot = of_two_views(&gpu);
-    let (dataset, config) = (&shot.dataset, short());
+    let shot = of_two_views();
+    let preparation = ["deformable.warm_iterations=20", "deformable.track_iterations=5"];
+    let (dataset, config) = (&shot.dataset, with_values(&short(), preparation).unwrap());
     let mut alone = config.with(&["gaussians.fits=1".into()]).unwrap();
     alone.seed += 1;
     let mut first = Trainer::new(&gpu, Plan::new(&alone, dataset).unwrap(), dataset, tuning(&gpu)).unwrap();

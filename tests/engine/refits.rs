@@ -17,40 +17,45 @@ use nertca_vk_phantom::dataset::{PhantomOptions, Setting, make};
 use nertca_vk_phantom::degradations::Degradations;
 use nertca_vk_phantom::views::ViewAngles;
 use nertca_vk_runs::session::{FrameTime, NewFrame, Session, SessionOptions};
+use nertca_vk_twins::selftest::problems::with_values;
 use nertca_vk_vessels::score::eval::evaluate;
+use std::sync::OnceLock;
 
 const PHASES: u32 = 10;
 /// Iterations of Gaussians; a continued fit skips the first third.
 const GAUSSIAN_ITERATIONS: u32 = 120;
 const CARRIED: u32 = 40;
 
-fn phantom(gpu: &Gpu) -> (tempfile::TempDir, Dataset) {
-    let directory = tempfile::tempdir().unwrap();
-    let options = PhantomOptions {
-        setting: Setting::SmallXcat,
-        anatomy: None,
-        size: 64,
-        phases: PHASES,
-        views: ViewAngles::published(4).unwrap(),
-        seed: 1,
-        stenoses: Vec::new(),
-        degradations: Degradations::default(),
-        layout: Layout::Native,
-        volumes_every: None,
-    };
-    make(gpu, &options, &directory.path().join("data"), |_, _, _| ()).unwrap();
-    let dataset = Dataset::open(&directory.path().join("data")).unwrap();
-    (directory, dataset)
+/// A phantom of 64 x 64 pixels, made once.
+fn phantom() -> &'static Dataset {
+    static DATASET: OnceLock<Dataset> = OnceLock::new();
+    DATASET.get_or_init(|| {
+        let (gpu, directory) = (gpu(), tempfile::tempdir().unwrap());
+        let options = PhantomOptions {
+            setting: Setting::SmallXcat,
+            anatomy: None,
+            size: 64,
+            phases: PHASES,
+            views: ViewAngles::published(4).unwrap(),
+            seed: 1,
+            stenoses: Vec::new(),
+            degradations: Degradations::default(),
+            layout: Layout::Native,
+            volumes_every: None,
+        };
+        make(&gpu, &options, &directory.path().join("data"), |_, _, _| ()).unwrap();
+        expect_silence(gpu);
+        Dataset::open(&directory.path().join("data")).unwrap()
+    })
 }
 
 fn session(gpu: &Gpu, dataset: &Dataset) -> Session {
-    session_of(gpu, dataset, GaussianForm::Deformable, GAUSSIAN_ITERATIONS + 1)
+    session_of(gpu, dataset, &["gaussians.form=deformable"], GAUSSIAN_ITERATIONS + 1)
 }
 
-fn session_of(gpu: &Gpu, dataset: &Dataset, form: GaussianForm, iterations: u32) -> Session {
-    let mut config = Config::preset(Preset::Fast);
+fn session_of(gpu: &Gpu, dataset: &Dataset, settings: &[&str], iterations: u32) -> Session {
+    let mut config = with_values(&Config::preset(Preset::Fast), settings.iter().copied()).unwrap();
     config.train.iterations = iterations;
-    config = config.with(&[format!("gaussians.form={}", form.name())]).unwrap();
     let options = SessionOptions {
         config,
         phases: PHASES,
@@ -98,38 +103,38 @@ fn dice(gpu: &Gpu, session: &Session, dataset: &Dataset) -> f64 {
 #[ignore = "long: tools/test --all"]
 fn gaussians_go_on_where_they_explain_what_is_new() {
     let gpu = gpu();
-    let (directory, dataset) = phantom(&gpu);
-    let at_once = session(&gpu, &dataset);
-    add(&at_once, &dataset, |_| true);
+    let (directory, dataset) = (tempfile::tempdir().unwrap(), phantom());
+    let at_once = session(&gpu, dataset);
+    add(&at_once, dataset, |_| true);
     assert_eq!(train(&at_once), GAUSSIAN_ITERATIONS + 1);
-    let (wanted, anew) = (dice(&gpu, &at_once, &dataset), field(&at_once));
+    let (wanted, anew) = (dice(&gpu, &at_once, dataset), field(&at_once));
     drop(at_once);
 
     // The last two phases lie between known ones.
     let (early, late) = (|f: &Frame| f.phase < 8, |f: &Frame| f.phase >= 8);
-    let grown = session(&gpu, &dataset);
-    add(&grown, &dataset, early);
+    let grown = session(&gpu, dataset);
+    add(&grown, dataset, early);
     train(&grown);
     let saved = directory.path().join("early.safetensors");
     grown.checkpoint().unwrap().write(&saved).unwrap();
-    add(&grown, &dataset, late);
+    add(&grown, dataset, late);
     assert_eq!(train(&grown), GAUSSIAN_ITERATIONS + 1 - CARRIED);
-    let reached = dice(&gpu, &grown, &dataset);
+    let reached = dice(&gpu, &grown, dataset);
     println!("at once {wanted}, grown {reached}");
     assert!(reached > wanted - 0.01, "{reached}, where all frames at once reach {wanted}");
-    let loaded = session(&gpu, &dataset);
+    let loaded = session(&gpu, dataset);
     loaded.load(Checkpoint::read(&saved).unwrap()).unwrap();
-    add(&loaded, &dataset, |_| true);
+    add(&loaded, dataset, |_| true);
     assert_eq!(train(&loaded), GAUSSIAN_ITERATIONS + 1 - CARRIED);
     assert_eq!(field(&loaded), field(&grown), "also across save and load");
     drop((grown, loaded));
 
     // Half of the beat, or another view, is new information that restarts the fit.
     for late in [&(|f: &Frame| f.phase > 4) as &dyn Fn(&Frame) -> bool, &|f: &Frame| f.view == 3] {
-        let grown = session(&gpu, &dataset);
-        add(&grown, &dataset, |f| !late(f));
+        let grown = session(&gpu, dataset);
+        add(&grown, dataset, |f| !late(f));
         train(&grown);
-        add(&grown, &dataset, late);
+        add(&grown, dataset, late);
         assert_eq!(train(&grown), GAUSSIAN_ITERATIONS + 1);
         assert_eq!(field(&grown), anew);
     }
@@ -141,14 +146,17 @@ fn gaussians_go_on_where_they_explain_what_is_new() {
 fn short_runs_take_in_frames_as_well() {
     const ITERATIONS: u32 = 30;
     let gpu = gpu();
-    let (_directory, dataset) = phantom(&gpu);
+    let dataset = phantom();
     for form in [GaussianForm::Phase, GaussianForm::Deformable] {
-        let [at_once, grown] = [(); 2].map(|()| session_of(&gpu, &dataset, form, ITERATIONS));
-        add(&at_once, &dataset, |_| true);
+        // A short preparation: the fields are compared with each other alone.
+        let chosen = format!("gaussians.form={}", form.name());
+        let settings = [chosen.as_str(), "deformable.warm_iterations=20", "deformable.track_iterations=5"];
+        let [at_once, grown] = [(); 2].map(|()| session_of(&gpu, dataset, &settings, ITERATIONS));
+        add(&at_once, dataset, |_| true);
         assert_eq!(train(&at_once), ITERATIONS);
-        add(&grown, &dataset, |f| f.phase < 8);
+        add(&grown, dataset, |f| f.phase < 8);
         assert_eq!(train(&grown), ITERATIONS);
-        add(&grown, &dataset, |f| f.phase >= 8);
+        add(&grown, dataset, |f| f.phase >= 8);
         assert_eq!(train(&grown), ITERATIONS);
         assert_eq!(field(&grown), field(&at_once), "{form:?}");
     }
@@ -158,17 +166,17 @@ fn short_runs_take_in_frames_as_well() {
 #[test]
 fn what_was_there_is_shown_until_there_is_better() {
     let gpu = gpu();
-    let (_directory, dataset) = phantom(&gpu);
+    let dataset = phantom();
     let earlier = {
-        let three_views = session(&gpu, &dataset);
-        add(&three_views, &dataset, |f| f.view < 3);
+        let three_views = session(&gpu, dataset);
+        add(&three_views, dataset, |f| f.view < 3);
         three_views.train(2, &mut |_| true).unwrap();
         field(&three_views)
     };
-    let plan = Plan::new(&Config::preset(Preset::Fast), &dataset).unwrap();
+    let plan = Plan::new(&Config::preset(Preset::Fast), dataset).unwrap();
     let shown = FitField::of_gaussians(earlier.clone());
     let from = Start { field: Some((&shown, Use::GoOn)), ..Start::default() };
-    let mut trainer = Trainer::begin(&gpu, plan, &dataset, tuning(&gpu), from).unwrap();
+    let mut trainer = Trainer::begin(&gpu, plan, dataset, tuning(&gpu), from).unwrap();
     let feed = trainer.feed().gaussians.unwrap();
     let shown = || feed.lock().unwrap().1.clone();
     let (mut with_earlier, mut with_sets) = (0, 0);

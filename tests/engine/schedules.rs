@@ -66,7 +66,8 @@ fn every_preset_trains_past_the_last_event_of_its_schedule() {
     let dataset = phantom(&gpu, directory.path(), 32, 4);
     for preset in Preset::ALL {
         let mut settings = match preset {
-            Preset::NerfCa | Preset::R2Gaussian | Preset::XGaussian | Preset::SaxNerf => vec![],
+            Preset::R2Gaussian | Preset::XGaussian | Preset::SaxNerf => vec![],
+            Preset::NerfCa => vec!["train.rays=32", "train.chunk_samples=16384"],
             _ => vec!["train.rays=32", "train.chunk_samples=8192"],
         };
         settings.extend(match preset {

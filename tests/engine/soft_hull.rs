@@ -1,7 +1,7 @@
 //! The soft hull on phantoms with a known truth: the kept share of the vessels and of the box, at four noise levels.
 
 use crate::common;
-use crate::common::{drop_first_view, gpu, phantom, whiten};
+use crate::common::{drop_first_view, gpu, phantom_with_volumes, whiten};
 use glam::DVec3;
 use nertca_vk::formats::volume::VolumeHints;
 use nertca_vk::formats::volume_files;
@@ -105,7 +105,7 @@ fn strongest(motion: &SoftMotion) -> f64 {
 fn vessels_are_kept_and_little_else_at_four_noise_levels() {
     let gpu = gpu();
     let directory = tempfile::tempdir().unwrap();
-    let clean = phantom(&gpu, directory.path(), 100, 4);
+    let clean = phantom_with_volumes(&gpu, directory.path(), 100, 4);
     let s = strongest(&SoftMotion::new(&clean, HALF, 32));
     // Noise as a share of the strongest vessel; minimum recall of all and of thin vessels; maximum share of the box, %.
     let four = [(0.0, 0.94, 0.90, 0.5), (0.01, 0.93, 0.88, 0.4), (0.03, 0.91, 0.84, 0.4), (0.1, 0.85, 0.67, 0.5)];

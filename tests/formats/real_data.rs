@@ -106,8 +106,10 @@ fn the_reconstruction_lies_on_the_vessels_it_was_made_from() {
     let tuning = Tuning::for_device(gpu.info());
     let config = Config::load(Some(Preset::Fast), None, &["train.iterations=400".into()]).unwrap();
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning.clone()).unwrap();
-    while trainer.step() < 400 {
-        trainer.advance(400).unwrap();
+    // Only the Gaussians are looked at.
+    let end = config.gaussian_iterations();
+    while trainer.step() < end {
+        trainer.advance(end).unwrap();
     }
     let model = trainer.model().unwrap();
     let renderer = Renderer::new(&gpu, &model, tuning).unwrap();

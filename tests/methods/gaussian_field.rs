@@ -24,8 +24,20 @@ use nertca_vk_runs::run::reconstruct::{RunOptions, reconstruct};
 use nertca_vk_twins::selftest::blobs;
 use nertca_vk_twins::selftest::problems::{drawn_fields, with_values};
 use std::path::Path;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
+
+/// The default phantom in 40 x 40 pixels, made once.
+pub fn small_phantom() -> &'static Dataset {
+    static DATASET: OnceLock<(tempfile::TempDir, Dataset)> = OnceLock::new();
+    let (_, dataset) = DATASET.get_or_init(|| {
+        let (gpu, directory) = (gpu(), tempfile::tempdir().unwrap());
+        let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+        expect_silence(gpu);
+        (directory, dataset)
+    });
+    dataset
+}
 
 /// Creates a model of a dataset with the dynamic field `field`.
 fn model(gpu: &Gpu, dataset: &Dataset, field: GaussianField) -> Model {
@@ -203,7 +215,7 @@ fn short_run(form: &str) -> Config<GaussiansSettings> {
 fn resume_equals_no_interruption() {
     let gpu = gpu();
     let directory = tempfile::tempdir().unwrap();
-    let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+    let dataset = small_phantom();
     // With an adjustment of views, the fit is done before the run, and its iterations pass at once.
     let (off, auto) = (AdjustMode::Off, AdjustMode::Auto);
     for (form, fits, adjust) in [("phase", 1, off), ("tree", 1, off), ("tree", 2, off), ("tree", 1, auto)] {
@@ -214,7 +226,7 @@ fn resume_equals_no_interruption() {
             let cancel = AtomicBool::new(false);
             let options = RunOptions { tuning: &tuning(&gpu), run: &path, resume, stop_at: None, cancel: &cancel };
             let config = config.clone().into_any();
-            let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut |event| {
+            let outcome = reconstruct(&gpu, &config, dataset, &options, &mut |event| {
                 if stop.is_some_and(|stop| stop(event)) {
                     cancel.store(true, Ordering::Relaxed);
                 }
@@ -250,13 +262,12 @@ fn resume_equals_no_interruption() {
 #[test]
 fn the_still_field_learns_what_gaussians_leave() {
     let gpu = gpu();
-    let directory = tempfile::tempdir().unwrap();
-    let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+    let dataset = small_phantom();
     let mut config = short_run("phase");
     // After so few iterations, vessels are not dense yet.
     (config.train.iterations, config.gaussians.clear_at) = (160, 0);
     let config = config.into_any();
-    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    let mut trainer = Trainer::new(&gpu, Plan::new(&config, dataset).unwrap(), dataset, tuning(&gpu)).unwrap();
     let losses = run(&mut trainer, 160);
     assert_eq!(losses.len(), 160);
     assert!(losses[19] < 0.7 * losses[0], "Gaussians: {} to {}", losses[0], losses[19]);
@@ -277,8 +288,7 @@ fn the_still_field_learns_what_gaussians_leave() {
 #[test]
 fn other_images_begin_the_fit_anew_and_keep_device_and_host_in_step() {
     let gpu = gpu();
-    let directory = tempfile::tempdir().unwrap();
-    let mut dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+    let mut dataset = small_phantom().clone();
     let config = short_run("phase").into_any();
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     run(&mut trainer, 32);
@@ -302,13 +312,12 @@ fn other_images_begin_the_fit_anew_and_keep_device_and_host_in_step() {
 #[test]
 fn the_mean_of_fits_holds_all_of_them_and_their_agreement() {
     let gpu = gpu();
-    let directory = tempfile::tempdir().unwrap();
-    let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+    let dataset = small_phantom();
     let field = |form: &str, seed: u32, fits: u32| {
         let mut config = short_run(form);
         (config.seed, config.gaussians.fits, config.train.iterations) = (seed, fits, 21);
         let config = config.into_any();
-        let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+        let mut trainer = Trainer::new(&gpu, Plan::new(&config, dataset).unwrap(), dataset, tuning(&gpu)).unwrap();
         let losses = run(&mut trainer, 21);
         assert_eq!(losses.len(), 21, "the iterations of the last fit, and one of the static field");
         (losses, trainer.model().unwrap().gaussians.unwrap())

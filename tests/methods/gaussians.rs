@@ -2,6 +2,7 @@
 
 use crate::common;
 use crate::common::{drop_first_view, expect_agreement, expect_silence, gpu, phantom, relative_error};
+use crate::gaussian_field::small_phantom;
 use crate::golden_file::Golden;
 use glam::DVec3;
 use nertca_vk::error::Result;
@@ -353,8 +354,7 @@ fn train_tree(gpu: &Gpu, targets: Targets, config: &Rules) -> Result<Gaussians> 
 #[test]
 fn a_reseeded_fit_moves_as_the_earlier_one_and_has_gaussians_of_its_own() {
     let gpu = gpu();
-    let directory = tempfile::tempdir().unwrap();
-    let dataset = phantom(&gpu, directory.path(), 40, 4);
+    let dataset = small_phantom();
     let config = with_gaussians(GaussianRules { iterations: 30, ..config().gaussians });
     let fitted = |trainer: &mut DeformableTrainer| {
         let mut losses = Vec::new();
@@ -363,12 +363,12 @@ fn a_reseeded_fit_moves_as_the_earlier_one_and_has_gaussians_of_its_own() {
         }
         losses
     };
-    let mut first = DeformableTrainer::new(&gpu, targets_of(&dataset), &config).unwrap();
+    let mut first = DeformableTrainer::new(&gpu, targets_of(dataset), &config).unwrap();
     fitted(&mut first);
     let earlier = first.deformable().unwrap();
     let other = Rules { seed: config.seed + 1, ..config.clone() };
     let from = Earlier { field: &earlier, step: 0, reseeds: true };
-    let mut second = DeformableTrainer::after(&gpu, targets_of(&dataset), &other, from).unwrap();
+    let mut second = DeformableTrainer::after(&gpu, targets_of(dataset), &other, from).unwrap();
     let seeded = second.deformable().unwrap();
     assert_eq!((second.step(), seeded.rest.rows.len()), (0, config.gaussians.count as usize));
     let n_basis = seeded.setup.n_basis as usize;
@@ -422,9 +422,10 @@ fn the_default_phantom_is_reconstructed() {
         if n_views == 3 {
             drop_first_view(&mut dataset);
         }
+        let targets = targets_of(&dataset);
         for ((form, train), min) in FORMS.into_iter().zip([PHASE_DICE, TREE_DICE]) {
             let start = Instant::now();
-            let model = train(&gpu, targets_of(&dataset), &config()).unwrap();
+            let model = train(&gpu, targets.clone(), &config()).unwrap();
             let seconds = start.elapsed().as_secs_f64();
             let dice = dice(&model, &dataset);
             println!("{form}, {n_views} views: Dice {dice:.3}, {} Gaussians, {seconds:.1} s", model.rows.len());
