@@ -41,8 +41,6 @@ pub enum GaussianForm {
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
 pub enum Rule {
-    /// Broad Gaussians that not all views show are dropped.
-    BroadParts,
     /// Gaussians far fainter than the vessels are dropped.
     FaintGaussians,
     /// Gaussians have a filling at each phase where contrast comes or goes.
@@ -55,8 +53,6 @@ pub enum Rule {
     IsolatedGaussians,
     /// Places that two views see are seeded by a regression on what both show, instead of by evidence alone.
     LikelihoodOfTwoViews,
-    /// Short components that the images do not support are dropped.
-    ShortParts,
     /// Motion is stiff with two views.
     StiffMotion,
     /// The motion of vessels that contrast does not show is that of other phases.

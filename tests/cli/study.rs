@@ -142,7 +142,7 @@ fn our_studies_can_be_run() {
         ("ablation", 36),
         ("time", 21),
         ("degradations", 204),
-        ("rules", 220),
+        ("rules", 180),
     ];
     for (name, runs) in expected {
         let file = studies.join(name).with_extension("toml");

@@ -7,7 +7,6 @@ pub mod filling;
 mod linked;
 mod members;
 mod membership;
-mod pruning;
 pub mod stages;
 pub mod start;
 mod unseen;
@@ -71,12 +70,10 @@ pub struct DeformableTrainer {
     n: u32,
     iterations: Iterations,
     step: u32,
-    /// Whether short components that the images do not support are dropped at the end.
-    prunes: bool,
+    /// Whether a catheter is looked for at the end.
+    finds_catheter: bool,
     /// Catheter that was found at the end.
     catheter: Option<Catheter>,
-    /// Number of Gaussians broader than vessels that were dropped at the end.
-    n_broad: usize,
 }
 
 /// Setup, schedule and buffers of iterations of one kind: the joint fit of everything, or the tracking of a phase.
@@ -177,9 +174,8 @@ impl DeformableTrainer {
             n,
             iterations,
             step: 0,
-            prunes: true,
+            finds_catheter: true,
             catheter: None,
-            n_broad: 0,
         })
     }
 
@@ -293,9 +289,9 @@ impl DeformableTrainer {
         Ok(self.gpu.wait(recording.finish()?.submit()?)?)
     }
 
-    /// Keeps short components that the images do not support, as happens to vessels where poses are wrong.
-    pub(super) fn keep_unsupported(&mut self) {
-        self.prunes = false;
+    /// Looks for no catheter at the end: where poses are wrong, vessels move as one.
+    pub(super) fn ignore_catheter(&mut self) {
+        self.finds_catheter = false;
     }
 
     /// Iterations done, those of the sets per phase and of tracking not counted.
@@ -389,8 +385,7 @@ impl DeformableTrainer {
         self.step += self.iterations.run(&self.gpu, first, stop)?;
         if setup::parts_from_strays(&self.config.gaussians, self.step) {
             self.drop_strays()?;
-            self.drop_unsupported()?;
-            if self.prunes {
+            if self.finds_catheter {
                 self.find_catheter()?;
             }
         }
@@ -433,7 +428,16 @@ impl DeformableTrainer {
     /// # Errors
     /// Device errors.
     pub fn images(&self) -> Result<Vec<f32>> {
-        self.images_of(&self.members, self.n)
+        let mut images = Vec::with_capacity(self.targets.n_images * self.targets.n_pixels());
+        for part in &self.joint.parts {
+            let mut recording = Recording::new(&self.gpu, "images of a deformable")?;
+            let mut pass = pass(&mut recording, &self.kernels, &self.joint, &self.members, self.n);
+            pass.gaussians.targets = &part.buffers;
+            record_images(&mut pass, part.phases.clone())?;
+            self.gpu.wait(recording.finish()?.submit()?)?;
+            take_images(&self.gpu, part, &self.targets, &self.joint.setup, &mut images)?;
+        }
+        Ok(images)
     }
 
     /// Images of the present field that other `views` see, one for each image of the targets.
@@ -452,20 +456,6 @@ impl DeformableTrainer {
         let images = self.images();
         upload(&self.targets.views)?;
         images
-    }
-
-    /// Images of `n` Gaussians that move on the present grid.
-    fn images_of(&self, members: &MemberBuffers, n: u32) -> Result<Vec<f32>> {
-        let mut images = Vec::with_capacity(self.targets.n_images * self.targets.n_pixels());
-        for part in &self.joint.parts {
-            let mut recording = Recording::new(&self.gpu, "images of a deformable")?;
-            let mut pass = pass(&mut recording, &self.kernels, &self.joint, members, n);
-            pass.gaussians.targets = &part.buffers;
-            record_images(&mut pass, part.phases.clone())?;
-            self.gpu.wait(recording.finish()?.submit()?)?;
-            take_images(&self.gpu, part, &self.targets, &self.joint.setup, &mut images)?;
-        }
-        Ok(images)
     }
 
     /// The deformable set after the iterations done.

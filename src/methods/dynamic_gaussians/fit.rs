@@ -135,7 +135,7 @@ impl GaussianFit {
     /// Returns findings about the data since the last call, for the user.
     pub(crate) fn take_findings(&mut self) -> Vec<String> {
         match self {
-            GaussianFit::Deformable(fit, _) => fit.take_findings(),
+            GaussianFit::Deformable(fit, _) => fit.take_finding().into_iter().collect(),
             GaussianFit::Made(fit) => fit.take_findings(),
             GaussianFit::PerPhase(_) | GaussianFit::Start(..) => Vec::new(),
         }

@@ -7,6 +7,7 @@ use crate::geometry::MM_PER_UNIT;
 use crate::methods::dynamic_gaussians::deformable::linked::{extent, groups, grown};
 use glam::DVec3;
 
+// Numbers of this file without another source: chosen on one anatomy (docs/methods/gaussians.md, Schedule).
 /// Motion, as a share of that of the median Gaussian, below which a Gaussian is slow.
 const SLOW: f64 = 0.4;
 /// Motion of the slowest Gaussian of a catheter, in the same unit. The vessels of 40 data sets with the motion of a healthy heart have no

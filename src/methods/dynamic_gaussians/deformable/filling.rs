@@ -12,7 +12,7 @@ use glam::DVec3;
 
 /// Minimum filling; it is above zero because the gradient is divided by the filling.
 pub const MIN_FILLING: f32 = 0.01;
-/// Adam's rate of fillings.
+/// Adam's rate of fillings, per iteration.
 pub const FILLING_RATE: f32 = 0.05;
 
 /// Filling with Adam's moments: `[Gaussian][phase]`.

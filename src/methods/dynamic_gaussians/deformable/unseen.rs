@@ -7,7 +7,8 @@ use glam::DVec3;
 
 /// Share of the vessels' mass from which on a phase is seen well.
 const WELL_SEEN: f64 = 0.9;
-/// Filling below which the place of a Gaussian is arbitrary.
+/// Filling below which the place of a Gaussian is arbitrary. Without this limit, real anatomy with an inflow of 0.4 s has a Dice of .871
+/// instead of .885.
 const LEAST_FILLING: f64 = 0.5;
 /// Weight of squared velocities against squared accelerations of a smooth curve, in phases.
 const VELOCITY: f64 = 0.3;
