@@ -749,7 +749,8 @@ typedef struct {
   /**
    * Half width of the interval that contains the true centreline with a probability of 68 %, along the least certain direction across the
    * vessel, for each point, mm. This array and the next two may be null, and have room for `points` elements otherwise. They hold NaN where
-   * the reconstruction has no frames to compare with, as after a checkpoint was loaded.
+   * the reconstruction has no frames to compare with, as after a checkpoint was loaded, and with two views, whose vessels may have exchanged
+   * their depths where they cross.
    */
   double *doubt_mm;
   /**

@@ -167,8 +167,8 @@ class Branch:
     """Radius of the vessel at each point, mm, of shape (points,)."""
     doubt_mm: Optional[npt.NDArray[np.float64]] = None
     """Half width of the interval that contains the true centreline with a probability of 68 %, along the least certain direction across the
-    vessel, for each point, mm; NaN where there are no frames to compare with, as after a checkpoint was loaded. None for a branch of a
-    user's own."""
+    vessel, for each point, mm; NaN where there are no frames to compare with, as after a checkpoint was loaded, and with two views, whose
+    vessels may have exchanged their depths where they cross. None for a branch of a user's own."""
     doubt_with_motion_mm: Optional[npt.NDArray[np.float64]] = None
     """Half width for the material point, mm, which also holds its motion along the vessel; NaN where points are not followed."""
     existence: Optional[npt.NDArray[np.float64]] = None

@@ -2,6 +2,7 @@
 
 use clap::Args;
 use nertca_vk::calibrate::calibrate;
+use nertca_vk::calibrate::choose::Correction;
 use nertca_vk::check::{Check, check};
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::{Error, Result};
@@ -76,8 +77,14 @@ fn print(dataset: &Dataset, found: &Check) -> Result<()> {
     found.warnings.iter().for_each(|w| out!("warning: {w}"));
     if !found.faulty() {
         let config = Config::preset(Preset::default());
-        calibrate(dataset, config.calibration())?.notes.iter().for_each(|note| out!("{note}"));
-        out!("{}", found.conclusion());
+        let calibration = calibrate(dataset, config.calibration())?;
+        calibration.notes.iter().for_each(|note| out!("{note}"));
+        let [_, by_chance] = found.explained;
+        let explained = match calibration.correction {
+            Correction::Stated => found.explained,
+            _ => [calibration.explained[1], calibration.explained_by_chance.unwrap_or(by_chance)],
+        };
+        out!("{}", Check { explained, ..found.clone() }.conclusion());
     }
     Ok(())
 }

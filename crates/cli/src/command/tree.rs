@@ -321,6 +321,12 @@ pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
             tree.components()
         );
     }
+    if beat.views.len() < doubt::LEAST_VIEWS && !beat.views.is_empty() {
+        eprintln!(
+            "how far points are known is not stated: two views are explained as well by vessels that exchange their depths where they cross; \
+             a third view decides (`next` names one)"
+        );
+    }
     // Followed points keep their radii, so that lesions differ between phases only as far as lengths change.
     let measured = MeasuredBeat::new(&beat);
     let with_lesions = if beat.reference_phase.is_some() { 1 } else { beat.phases.len() };

@@ -174,6 +174,10 @@ fn table(beat: &BeatTree, name: &str, tree: &PhaseTree) -> Markup {
                     "probability of " (format!("{:.0}", 100.0 * CONFIDENCE)) " %, in its least certain direction. \"Exists\" is the mean "
                     "probability that a true vessel is within " (EXISTS_WITHIN_MM) " mm." }
             }
+            @if beat.views.len() == 2 {
+                p { "How far points are known is not stated: two views are explained as well by vessels that exchange their depths where they "
+                    "cross." }
+            }
             (lesion_section::section(beat, tree))
             @if let Some(mm) = tree.doubtful_mm().filter(|mm| *mm > 0.0) {
                 p { "The field is the mean of several fits. \"Other fits\" is the share of them that have a vessel there. Less than "

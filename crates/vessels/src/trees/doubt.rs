@@ -30,27 +30,18 @@ const WITHOUT_IMAGES_PX: f64 = 0.1;
 const LEFT_EXPONENT: f64 = 0.5;
 /// Error that calibration leaves of a disagreement of 1 mm with three views, mm.
 const LEFT_OF_THREE_MM: f64 = 0.15;
-/// Maximum error that calibration leaves of a disagreement of 1 mm, mm: two views.
-const LEFT_MAX_MM: f64 = 0.5;
 /// Error of the motion along a vessel: its share of the displacement since the reference phase, and its maximum, mm.
 const ALONG_SHARE: f64 = 0.5;
 const ALONG_MAX_MM: f64 = 1.0;
 
-// Lines through the distances from true vessels and the shares of true points that five trees with two views, and degraded data with more views, had
-// at five shares of agreement (`docs/performance.md`, doubt).
-/// Half width of the interval of false crossings with two views, mm, where all other fits have a vessel at the point, its growth with the share
-/// of the fits that have none, and its maximum.
-const FALSE_CROSSINGS_MIN_MM: f64 = 0.2;
-const FALSE_CROSSINGS_GROWTH_MM: f64 = 8.0;
-const FALSE_CROSSINGS_MAX_MM: f64 = 4.0;
-/// Half width of that interval for a single fit of two views, mm.
-const SINGLE_FALSE_CROSSINGS_MM: f64 = 2.2;
-/// Probability that a point exists with two views, where all other fits have a vessel there; it is proportional to their share.
-const EXISTENCE_OF_TWO: f64 = 0.8;
-/// Decrease of the probability that a point exists with more views, where no other fit has a vessel there; it is proportional to their share.
-const ABSENCE_OF_MORE: f64 = 0.25;
-/// Probability that a point of a single fit exists: with two views, and with more.
-const EXISTENCE_SINGLE: [f64; 2] = [0.61, 0.997];
+/// Decrease of the probability that a point exists where no other fit has a vessel there; it is proportional to their share. Line through the
+/// shares of true points that degraded data had at five shares of agreement (`docs/performance.md`, doubt).
+const ABSENCE: f64 = 0.25;
+/// Probability that a point of a single fit exists.
+const EXISTENCE_SINGLE: f64 = 0.997;
+/// Minimum number of training views for which doubt is stated: two views are explained as well by vessels that have exchanged their depths
+/// where they cross, and no length bounds that error.
+pub const LEAST_VIEWS: usize = 3;
 
 /// States in a tree what depends on the training views of its dataset: the views themselves, the radii that their images show, and, with
 /// the disagreement of the views as stated, px, the doubt about each point. Returns why radii remain those of the field, where they do.
@@ -67,20 +58,23 @@ pub fn compare_with_views(
     reason
 }
 
-/// States the doubt about all points of a tree. The dataset has the geometry that the reconstruction used, and
+/// States the doubt about all points of a tree with [`LEAST_VIEWS`] training views or more. The dataset has the geometry that the reconstruction used, and
 /// `disagreement_px` is the disagreement of its views as stated ([`crate::calibrate::correction::Calibration::disagreement_px`]). A phase
 /// that the dataset does not have is compared with no image. Large images are binned: in small pixels, noise moves the ridges.
 fn state_doubt(beat: &mut BeatTree, dataset: &Dataset, disagreement_px: f64) {
     let views = dataset.training_views();
-    let Some(first) = views.first() else { return };
-    let pixel_mm = |dataset: &Dataset| dataset.views[*first].rays.anchor[1].length() * MM_PER_UNIT;
+    let [first, ..] = views[..] else { return };
+    if views.len() < LEAST_VIEWS {
+        return;
+    }
+    let pixel_mm = |dataset: &Dataset| dataset.views[first].rays.anchor[1].length() * MM_PER_UNIT;
     let left_mm = left_by_calibration_mm(views.len(), disagreement_px * pixel_mm(dataset));
     let dataset = &binned_to(dataset, RIDGE_SIDE);
     let backgrounds: Vec<Background> = Series::each(dataset).map(Background::new).collect();
     let shown: Vec<Vec<FrameView<'_>>> =
         beat.phases.iter().map(|tree| frame_views(tree, dataset, &backgrounds, beat.resolution_mm)).collect();
     let from_images_mm = pixel_mm(dataset) * image_error_px(&beat.phases, &shown);
-    let scale = Scale { image_mm: from_images_mm.hypot(left_mm), n_views: views.len() };
+    let scale = Scale { image_mm: from_images_mm.hypot(left_mm) };
     let reference = beat.phases.iter().find(|tree| Some(tree.phase) == beat.reference_phase).cloned();
     for (tree, shown) in beat.phases.iter_mut().zip(&shown) {
         for b in 0..tree.branches.len() {
@@ -176,16 +170,13 @@ fn image_error_px(phases: &[PhaseTree], shown: &[Vec<FrameView<'_>>]) -> f64 {
 
 /// Returns the error that calibration leaves of a disagreement of the stated views, mm. Each further view constrains the others.
 fn left_by_calibration_mm(n_views: usize, disagreement_mm: f64) -> f64 {
-    let of_one_mm = LEFT_OF_THREE_MM * (2.0 / (n_views as f64 - 1.0).max(1.0)).powi(2);
-    of_one_mm.min(LEFT_MAX_MM) * disagreement_mm.powf(LEFT_EXPONENT)
+    LEFT_OF_THREE_MM * (2.0 / (n_views as f64 - 1.0)).powi(2) * disagreement_mm.powf(LEFT_EXPONENT)
 }
 
 /// Scale of the errors of a reconstruction.
 struct Scale {
     /// Error of the images of centrelines, mm at the isocentre.
     image_mm: f64,
-    /// Number of training views.
-    n_views: usize,
 }
 
 impl Scale {
@@ -200,28 +191,13 @@ impl Scale {
     ) -> Doubt {
         let information = rays.fold(Information::none(tangent), |sum, ray| sum.with(ray));
         let (direction, dilution) = information.least_certain();
-        let seen_mm = self.image_mm * dilution;
-        let across_mm = match (self.n_views, agreement) {
-            (..=2, None) => seen_mm.hypot(SINGLE_FALSE_CROSSINGS_MM),
-            (..=2, Some(share)) => seen_mm.hypot(false_crossings_mm(share)),
-            // Where few of the other fits have a vessel, errors were seen to be up to twice as large.
-            (_, Some(share)) => seen_mm * (2.0 - share),
-            (_, None) => seen_mm,
-        };
-        let existence = match (self.n_views, agreement) {
-            (..=2, None) => EXISTENCE_SINGLE[0],
-            (_, None) => EXISTENCE_SINGLE[1],
-            (..=2, Some(share)) => EXISTENCE_OF_TWO * share,
-            (_, Some(share)) => EXISTENCE_SINGLE[1] - ABSENCE_OF_MORE * (1.0 - share),
-        };
+        // Where few of the other fits have a vessel, errors were seen to be up to twice as large.
+        let absence = 1.0 - agreement.unwrap_or(1.0);
+        let across_mm = self.image_mm * dilution * (1.0 + absence);
+        let existence = EXISTENCE_SINGLE - ABSENCE * absence;
         let with_motion_mm = moved_mm.map(|moved_mm| across_mm.max((ALONG_SHARE * moved_mm).min(ALONG_MAX_MM)));
         Doubt { across_mm, direction, with_motion_mm, existence }
     }
-}
-
-/// Returns the half width of the interval of false crossings with two views, mm, for the share of the other fits that have a vessel at the point.
-fn false_crossings_mm(share: f64) -> f64 {
-    (FALSE_CROSSINGS_MIN_MM + FALSE_CROSSINGS_GROWTH_MM * (1.0 - share)).min(FALSE_CROSSINGS_MAX_MM)
 }
 
 #[cfg(test)]
@@ -234,21 +210,20 @@ mod tests {
 
     #[test]
     fn errors_of_images_and_calibration_add_up() {
-        let doubt = |n_views: usize, image_mm: f64, moved_mm: Option<f64>, agreement: Option<f64>| {
+        let doubt = |image_mm: f64, moved_mm: Option<f64>, agreement: Option<f64>| {
             let rays = [along(0.0), along(90.0)].into_iter();
-            Scale { image_mm, n_views }.doubt(rays, DVec3::Z, moved_mm, agreement)
+            Scale { image_mm }.doubt(rays, DVec3::Z, moved_mm, agreement)
         };
-        assert!((doubt(4, 0.2, None, None).across_mm - 0.2).abs() < 1e-9);
-        assert!((doubt(4, 0.2, None, Some(0.5)).across_mm - 0.3).abs() < 1e-9);
-        let across = doubt(4, 0.2, Some(0.2), None);
+        assert!((doubt(0.2, None, None).across_mm - 0.2).abs() < 1e-9);
+        assert!((doubt(0.2, None, Some(0.5)).across_mm - 0.3).abs() < 1e-9);
+        let across = doubt(0.2, Some(0.2), None);
         assert_eq!(across.with_motion_mm, Some(across.across_mm), "an error across the vessel is larger");
-        assert_eq!(doubt(4, 0.2, Some(1.0), None).with_motion_mm, Some(0.5));
-        assert_eq!(doubt(4, 0.2, Some(20.0), None).with_motion_mm, Some(ALONG_MAX_MM));
-        let of_two = [1.0, 0.7, 0.3].map(|share| doubt(2, 0.2, None, Some(share)));
-        assert!(of_two[0].across_mm < 0.3 && of_two[1].across_mm > 2.0, "{of_two:?}");
-        assert!(of_two[0].existence > of_two[1].existence && of_two[1].existence > of_two[2].existence);
+        assert_eq!(doubt(0.2, Some(1.0), None).with_motion_mm, Some(0.5));
+        assert_eq!(doubt(0.2, Some(20.0), None).with_motion_mm, Some(ALONG_MAX_MM));
+        let existence = [Some(0.0), Some(0.5), None].map(|share| doubt(0.2, None, share).existence);
+        assert!(existence.windows(2).all(|pair| pair[0] < pair[1]), "{existence:?}");
         // More views leave less of an error, and no disagreement leaves none.
-        let left = [2, 3, 4, 9].map(|n| left_by_calibration_mm(n, 2.0));
+        let left = [3, 4, 9].map(|n| left_by_calibration_mm(n, 2.0));
         assert!(left.windows(2).all(|pair| pair[1] < 0.6 * pair[0]), "{left:?}");
         assert_eq!(left_by_calibration_mm(3, 0.0), 0.0);
     }
