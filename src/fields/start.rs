@@ -7,6 +7,7 @@ use crate::scan::dataset::{Dataset, Frame};
 use glam::DVec3;
 use rayon::prelude::*;
 
+// Numbers of this file: tried on the default phantom with right and wrong geometry, and on real anatomy.
 /// Number of rays that are looked at.
 const RAYS: f64 = 4000.0;
 /// Depths of a ray at which the hull is looked up.

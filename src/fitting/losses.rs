@@ -86,7 +86,8 @@ impl StepLoss {
     }
 }
 
-/// Multiple of the first loss at which a warning is issued.
+/// Multiple of the first loss at which a warning is issued. At the published rates of NerT-CA, losses grow by a factor of 1e7 and more
+/// (docs/methods/nert-ca.md).
 const LARGE: f64 = 1e6;
 /// Settings that make the steps of a static tensor field smaller.
 pub(crate) const SMALLER_STEPS: &str = "a lower static.lr";

@@ -3,9 +3,9 @@
 use crate::error::{Error, Result};
 use crate::scan::gating::RPeaks;
 
-/// Shortest possible beat, seconds.
+/// Shortest possible beat, seconds. It is that of 200 beats per minute.
 const SHORTEST_BEAT_S: f64 = 0.3;
-/// Width of a QRS complex, seconds.
+/// Width of a QRS complex, seconds. It is the upper limit of a normal one.
 const QRS_S: f64 = 0.12;
 
 /// Returns the R-peaks of a trace with `rate_hz` samples per second, whose first sample is at time 0.

@@ -14,8 +14,8 @@ use std::ops::{Range, RangeInclusive};
 pub(super) const SIDE: usize = 256;
 /// Largest accepted number of frames of a run: 20 s at 15 per second.
 const MAX_FRAMES: usize = 300;
-/// Bound of line integrals of vessels, in units of their median: where vessels overlap, and in the catheter, values say less of how much there
-/// is than of where.
+/// Bound of line integrals of vessels, in units of their median: where vessels overlap, and in the catheter, values say less of how much
+/// there is than of where. Without a bound, simulated runs have a Dice of .556 instead of .594 (docs/tried.md).
 const SATURATION: f32 = 2.0;
 
 /// Place of a run in the common beat, and in the room.

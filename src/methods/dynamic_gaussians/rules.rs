@@ -10,11 +10,11 @@
 use crate::config::sections::{GaussiansSettings, LeftOut, Train};
 use crate::config::{Config, GaussianForm};
 
-/// Adam's rate of log-scales.
+/// Adam's rate of natural log-scales, per iteration.
 pub const SCALE_RATE: f64 = 0.03;
-/// Adam's rate of quaternions.
+/// Adam's rate of the numbers of quaternions, per iteration.
 pub const ROTATION_RATE: f64 = 0.03;
-/// Adam's rate of log-densities.
+/// Adam's rate of natural log-densities, per iteration.
 pub const DENSITY_RATE: f64 = 0.08;
 /// Share of the iterations, at the end, over which rates fall.
 pub const FALL_SHARE: f64 = 0.3;

@@ -10,12 +10,14 @@ use crate::methods::dynamic_gaussians::rules::{
 };
 use crate::methods::dynamic_gaussians::targets::Targets;
 
-/// Decay of Adam's first and second moments, and its smallest denominator.
+/// Decay of Adam's first and second moments, and its smallest denominator. The decay was chosen on a procedural phantom and one real
+/// anatomy.
 const BETAS: [f32; 2] = [0.9, 0.98];
 const EPSILON: f32 = 1e-12;
 /// Decay of Adam's moments while a phase is tracked: little memory, for few iterations.
 const TRACK_BETAS: [f32; 2] = [0.8, 0.95];
-/// Share of the rate that is left at the end of a tracked phase; the rate falls to it linearly.
+/// Share of the rate that is left at the end of a tracked phase; the rate falls to it linearly. Chosen on a procedural phantom and one
+/// real anatomy.
 const TRACK_LAST_RATE: f64 = 0.2;
 /// Margin of the grid beyond the hull, pixels.
 const MARGIN: f64 = 2.0;

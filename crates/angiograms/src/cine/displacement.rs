@@ -5,6 +5,8 @@ use crate::evidence::lines::{blurred, over_frames};
 use crate::raster::{Image, median, percentile};
 use rayon::prelude::*;
 
+// Numbers of this file without another source: developed on simulated runs and on twelve clinical runs of two patients, which are
+// therefore no independent test (docs/tried.md, runs without ECG).
 /// Smallest and largest structures that are compared, standard deviations of Gaussians, mm at the isocentre.
 const BAND_MM: [f64; 2] = [0.65, 5.2];
 /// Robust standard deviations of the band at which values are cut off: each pixel then counts by area, so that a dark vessel is not stronger

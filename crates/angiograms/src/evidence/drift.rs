@@ -4,7 +4,7 @@
 //! each pixel.
 
 use crate::evidence::filters::map2;
-use crate::evidence::series::{MIN_NOISE_SHARE, Series, blur, opening_radius};
+use crate::evidence::series::{MIN_NOISE_SHARE, STRONGEST_PERCENTILE, Series, blur, opening_radius};
 use crate::raster::{Image, median, median_filter, percentile};
 use rayon::prelude::*;
 
@@ -21,13 +21,11 @@ const PHASES_PER_COURSE: usize = 3;
 const POWER_ROUNDS: usize = 100;
 /// Minimum size of a visible mode: its root mean square over the phases, as a share of the strongest change.
 const MIN_SIZE: f32 = 0.02;
-/// Minimum share of a view in which a mode must be visible: the remainders of crossing vessels after the median filter
-/// cover few places.
+/// Minimum share of a view in which a mode must be visible: the remainders of crossing vessels after the median filter cover few places.
+/// With 5 %, one of four diaphragms is not found (docs/tried.md).
 const MIN_SPREAD: f64 = 0.03;
 /// Minimum share of the wide part that a course must explain: in noise, all courses explain equal shares.
 const MIN_TOLD: f32 = 0.5;
-/// Percentile of the narrow part that counts as the strongest change.
-const STRONGEST_PERCENTILE: f64 = 0.995;
 /// Iterations of the fit of a pixel.
 const FIT_ROUNDS: usize = 20;
 /// Residuals above this many standard deviations over the fit belong to a vessel and are limited to this value.

@@ -9,13 +9,16 @@ use crate::evidence::filters::{gaussian, map2, rows_and_columns, separable};
 use crate::raster::{Image, dilate, median, opening, percentile};
 use rayon::prelude::*;
 
+// Numbers of this file without another source: developed on simulated runs and on twelve clinical runs of two patients, which are
+// therefore no independent test (docs/tried.md, runs without ECG).
 /// Radius of the opening that a thin structure does not survive, mm at the isocentre: vessels up to 7 mm wide are thin.
 const THIN_MM: f64 = 3.4;
 /// Standard deviation of the blur before the opening, mm, so that it does not follow single noisy pixels.
 const BLUR_MM: f64 = 0.35;
 /// Scales of the line filter, mm: half of the widths of vessels.
 const SCALES_MM: [f64; 4] = [0.39, 0.6, 0.9, 1.38];
-/// Smallest scale, pixels: below it, a line is one noisy pixel wide.
+/// Smallest scale, pixels: below it, a line is one noisy pixel wide. Smaller ones make pieces of noise in dense parts of the chest
+/// (docs/tried.md).
 const MIN_SCALE_PIXELS: f32 = 0.9;
 /// Contrast of a frame, a share of that of the run's fullest frames, below which it is empty.
 pub const EMPTY: f64 = 0.25;

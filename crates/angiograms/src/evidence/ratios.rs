@@ -10,6 +10,8 @@ use crate::raster::Image;
 use crate::scan::canvas::continued;
 use rayon::prelude::*;
 
+// Numbers of this file without another source: chosen by the share of the vessels' cells that the soft hull keeps, on a procedural
+// phantom and one real anatomy with several levels of noise.
 /// Amplitude of the weakest vessel sought, as a share of the view's strongest change.
 const MIN_SHARE_OF_STRONGEST: f32 = 0.08;
 /// The noise of a filter is low enough when it is at most the weakest vessel divided by this.
@@ -30,12 +32,11 @@ const LEAK: f32 = 0.25;
 const LEAK_PIXELS: usize = 2;
 /// Blur before the search for leakage, and of covered pixels in noise, pixels.
 const NEAR_BLUR: f32 = 0.7;
-/// Maximum evidence of a view for a cell: minus the logarithm of the share of pixels that vessels cover.
+/// Maximum evidence of a view for a cell: minus the natural logarithm of the share of pixels that vessels cover.
 pub const MOST: f32 = 3.0;
-/// Minimum evidence of a view, against a cell: the logarithm of the probability (9 %) that the view hides an existing
-/// vessel.
+/// Minimum evidence of a view, against a cell: the natural logarithm of the probability (9 %) that the view hides an existing vessel.
 pub const LEAST: f32 = -2.4;
-/// Evidence subtracted where only the opened background shows the vessel.
+/// Evidence (natural logarithm) subtracted where only the opened background shows the vessel.
 const COVERED_COST: f32 = 0.5;
 /// Number of amplitudes between the weakest and the strongest vessel.
 const AMPLITUDES: usize = 8;

@@ -6,6 +6,8 @@ use crate::scan::dataset::Dataset;
 
 /// Minimum noise, as a share of the strongest change: models have errors, too.
 pub(super) const MIN_NOISE_SHARE: f32 = 0.01;
+/// Percentile of the changes that counts as the strongest change.
+pub(super) const STRONGEST_PERCENTILE: f64 = 0.995;
 /// Minimum radius of an opening, pixels.
 const MIN_OPENING_RADIUS: usize = 2;
 

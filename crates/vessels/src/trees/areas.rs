@@ -22,6 +22,8 @@ use crate::trees::areas::slides::Slides;
 use crate::trees::tree::{BeatTree, PhaseTree, RadiiFrom};
 use std::f64::consts::PI;
 
+// Numbers of this file without another source: developed on five draws of stenoses in five trees; a sixth draw took no part
+// (docs/performance.md, Stenoses; docs/tried.md).
 /// Minimum smaller side, pixels, of the binned images in which areas are measured.
 const SIDE: usize = 200;
 /// Difference of the areas that both halves of the views show, as a share of the typical area, at which half of what images add to the field

@@ -7,6 +7,8 @@ use glam::DVec3;
 use std::f64::consts::TAU;
 use std::ops::RangeInclusive;
 
+// Numbers of this file without another source: developed on five draws of stenoses in five trees; a sixth draw took no part
+// (docs/performance.md, Stenoses; docs/tried.md).
 /// Diameter stenosis from which a narrowing is a lesion, percent. Healthy vessels of real anatomy vary by up to 25 %.
 pub const MIN_PERCENT: f64 = 30.0;
 /// Narrowing at which a lesion begins and ends, as a share of the reference diameter.

@@ -15,7 +15,8 @@ use crate::render::renderer::Renderer;
 pub const VESSEL_SHARE: f64 = 0.2;
 /// Attenuation per world unit above which the authors' public code takes a field for vessel, whatever the data.
 pub const PUBLISHED_THRESHOLD: f64 = 0.05;
-/// Values above this percentile are limited to it in the search for a threshold.
+/// Values above this percentile are limited to it in the search for a threshold. The 99th percentile is 0 where vessels cover less than 1
+/// % (docs/tried.md).
 const HOT: f64 = 0.995;
 
 /// Otsu's threshold of a list of values (256 bins).

@@ -4,6 +4,7 @@ use crate::methods::dynamic_gaussians::remainder::remainders;
 use crate::methods::dynamic_gaussians::targets::Targets;
 use rayon::prelude::*;
 
+// Numbers of this file: tried on real anatomy with all moderate degradations (docs/performance.md, Degradations).
 /// Line integral of the field, as a share of the strongest change, above which a pixel takes part.
 const ACTIVE: f32 = 0.03;
 /// Distance, pixels, within which the neighbours of such a pixel take part as well.

@@ -7,6 +7,7 @@ use crate::scan::prior::VesselPrior;
 use glam::{DVec3, I64Vec3};
 use std::collections::HashMap;
 
+// Numbers of this file: tried on five trees with a prior that is 3 % larger, displaced by 7 mm and bent by 1.5 mm (docs/performance.md).
 /// Distance from the prior's vessels up to which a place is near them, mm.
 const NEAR_MM: f64 = 3.0;
 /// Distance from which on a place is far from them, mm.

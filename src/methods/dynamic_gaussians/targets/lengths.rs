@@ -6,11 +6,13 @@ use crate::methods::dynamic_gaussians::rules::{DeformableRules, GaussianRules};
 use crate::raster::Image;
 use std::borrow::Borrow;
 
-/// Smaller side, pixels, of the images to which the settings' lengths refer.
+/// Smaller side, pixels, of the images to which the settings' lengths refer. It is the size of the default phantom, on which the settings
+/// were tuned.
 const SIDE: f64 = 100.0;
 /// Noise, as a share of the strongest change, from which on vessels are smoothed most.
 const SMOOTHEST_AT: f64 = 0.1;
-/// Factor on the minimum scale from that noise on; with less noise it grows in proportion.
+/// Factor on the minimum scale from that noise on; with less noise it grows in proportion. Chosen with the minimum scales of
+/// docs/tried.md (`min_scale`).
 const SMOOTHEST: f64 = 1.5;
 /// Upper limit of a minimum scale that noise has raised, as a share of the width of wide vessels.
 const SHARE_OF_WIDTH: f64 = 0.27;

@@ -14,6 +14,8 @@ use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 use std::f64::consts::PI;
 
+// Numbers of this file without another source: developed on five draws of stenoses in five trees; a sixth draw took no part
+// (docs/performance.md, Stenoses; docs/tried.md).
 /// Standard deviation of the blur of images and shadows, pixels: errors of the places of centrelines matter less in blurred images.
 const BLUR_PX: f64 = 0.6;
 /// Error of a shadow, as a share of its line integral.

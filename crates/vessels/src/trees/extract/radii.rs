@@ -7,7 +7,8 @@ use glam::DVec3;
 use rayon::prelude::*;
 use std::f64::consts::{PI, TAU};
 
-/// Number of directions of profiles. The median over them excludes directions that meet another vessel.
+/// Number of directions of profiles. The median over them excludes directions that meet another vessel. With the mean, errors of radii
+/// are .070 instead of .058 mm (docs/tried.md).
 const DIRECTIONS: u32 = 15;
 /// Step of a profile, in units of the field's resolution.
 const PROFILE_STEP: f64 = 0.125;

@@ -6,6 +6,7 @@ use crate::trees::sampled::SampledField;
 use crate::vessels::distances::DistanceMap;
 use crate::vessels::mask::Mask;
 
+// Numbers of this file: checked with straight tubes of 1.6 to 20 mm (docs/performance.md, tests/cli/wide_vessels.rs).
 /// Radius of the holes that are closed in thick vessels, in units of the field's resolution.
 const HOLE: f64 = 2.0;
 /// Radius of the smallest ball that a thick vessel holds once its holes are closed, in units of the field's resolution.

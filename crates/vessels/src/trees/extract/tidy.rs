@@ -7,14 +7,15 @@ use glam::DVec3;
 const DIRECTION: f64 = 3.0;
 /// Maximum width of a bridged gap, in units of the field's resolution.
 const GAP: f64 = 5.0;
-/// Maximum angle between an end's direction and its bridge.
+/// Maximum angle between an end's direction and its bridge. With 30 degrees, two branches are lost (docs/tried.md).
 const GAP_DEG: f64 = 45.0;
 /// Maximum width of the gap between two ends that face each other, in units of the field's resolution. Of 13 such gaps in trees with and without
 /// stenoses, 12 were gaps of one vessel, but only 1 of 8 as wide between an end and the side of a vessel.
 const STENOSIS: f64 = 10.0;
 /// Minimum length of a line whose end faces another, in units of the field's resolution: shorter ones have no direction.
 const STUB: f64 = 2.0;
-/// Maximum length of a speck, as a share of the longest tree's length.
+/// Maximum length of a speck, as a share of the longest tree's length. A limit of six pixels instead leaves ghosts at seven of ten phases
+/// (docs/tried.md).
 const SPECK: f64 = 0.05;
 
 /// A bridge from the end of one tree to a node of another.
