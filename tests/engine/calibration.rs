@@ -4,7 +4,7 @@ use crate::common::{gpu, small_dataset, tuning};
 use crate::disagreeing::{PHASES, Shot, Studio, Wrong};
 use glam::DVec3;
 use nertca_vk::calibrate::calibrate;
-use nertca_vk::calibrate::choose::{Correction, fit};
+use nertca_vk::calibrate::choose::{Correction, Tags, fit};
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::calibrate::observed::Observed;
 use nertca_vk::config::Config;
@@ -57,7 +57,7 @@ fn views_are_brought_together() {
         }
         let all: Vec<usize> = (0..PHASES as usize).collect();
         let observed = Observed::new(&shot.dataset);
-        let poses = fit(&observed, Correction::Breathing, &all);
+        let poses = fit(&observed, Correction::Breathing, Tags::Usual, &observed.fine.whole());
         for t in all {
             let mean = poses.gains.iter().map(|g| g[t]).sum::<f64>() / f64::from(n_views);
             assert!(mean.abs() < 1e-3, "mean contrast of phase {t}: {mean}");

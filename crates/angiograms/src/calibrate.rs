@@ -27,7 +27,7 @@ use crate::geometry::{MM_PER_UNIT, lps_mm_from_world};
 use crate::scan::canvas::corner;
 use crate::scan::dataset::Dataset;
 use adjustment::Adjusted;
-use choose::{Correction, Validated, best, fit, misfit, validate};
+use choose::{Correction, Tags, Validated, best, fit, validate};
 use correction::{Calibration, FrameCorrection, ViewCorrection};
 use estimate::{ACROSS_MM, ANGLE_DEG, DEPTH_MM, HEART_MM};
 use gauge::{FrameRays, RigidMotion, common_motion, frame_rays, heart_points};
@@ -38,19 +38,9 @@ use settings::{CalibrateMode, CalibrateSettings};
 
 /// Corrections beyond this many standard deviations of the expected errors are rejected.
 const BOUND: f64 = 4.0;
-/// Where vessels are cut off, profiles differ whatever the geometry, and in the same way at all phases. A correction must
-/// then leave at most this share of the squared residual. Collimator blades alone leave 0.80 or more of it when the stated
-/// geometry is right.
-const LARGE_GAIN_LEAVES: f64 = 0.65;
-/// In addition, the share of vessel pixels that the other views explain must not drop below the stated one by more than
-/// this: a correction that only brought ends of vessels together lowered it by 0.11.
-const LESS_EXPLAINED: f64 = 0.02;
-/// From this explained share of the vessel pixels, at the stated geometry, the differences of the profiles are attributed
-/// to cut-off vessels: blades alone have left 0.63 of the squared residual in views that explained 0.97 of each other.
-const WELL_EXPLAINED: f64 = 0.96;
-/// Alternatively, the correction must leave at most this share of the vessel pixels that the other views do not explain at
-/// the stated geometry.
-const LEFT_UNEXPLAINED: f64 = 0.75;
+/// Corrections that leave at most this share of the squared residual of planes to which they were not fitted are accepted beyond the bound:
+/// chance does not explain it.
+const EXPLAINS: f64 = 0.5;
 /// Changes over the beat below this share of the images' range are rounding errors.
 pub(crate) const MIN_CHANGE: f64 = 1e-5;
 
@@ -81,7 +71,10 @@ pub fn calibrate(dataset: &Dataset, settings: CalibrateSettings) -> Result<Calib
              correction is accepted only if the views agree clearly better with it"
         ));
     }
-    let candidates = candidates(mode, follows_breath, &mut notes);
+    if mode == CalibrateMode::Auto && !follows_breath && !dataset.still {
+        notes.push("the network supports corrections per view only, so breathing is not corrected".into());
+    }
+    let candidates = candidates(mode, follows_breath && !dataset.still);
     Ok(Calibrator { dataset, observed: &observed, notes }.choose(&candidates))
 }
 
@@ -166,16 +159,13 @@ fn nothing_to_tell(dataset: &Dataset, observed: &Observed) -> Option<String> {
 }
 
 /// Returns the corrections to try, the smallest first.
-fn candidates(mode: CalibrateMode, frames: bool, notes: &mut Vec<String>) -> Vec<Correction> {
+fn candidates(mode: CalibrateMode, breathes: bool) -> Vec<Correction> {
     match mode {
         CalibrateMode::Off => vec![Correction::Stated],
         CalibrateMode::Static => vec![Correction::Stated, Correction::Static],
         CalibrateMode::Breathing => vec![Correction::Stated, Correction::Breathing],
-        CalibrateMode::Auto if frames => vec![Correction::Stated, Correction::Static, Correction::Breathing],
-        CalibrateMode::Auto => {
-            notes.push("the network supports corrections per view only, so breathing is not corrected".into());
-            vec![Correction::Stated, Correction::Static]
-        }
+        CalibrateMode::Auto if breathes => vec![Correction::Stated, Correction::Static, Correction::Breathing],
+        CalibrateMode::Auto => vec![Correction::Stated, Correction::Static],
     }
 }
 
@@ -187,81 +177,40 @@ struct Calibrator<'a> {
 
 impl Calibrator<'_> {
     fn choose(mut self, candidates: &[Correction]) -> Calibration {
-        if self.observed.n_phases() < choose::MIN_PHASES {
-            return self.without_validation(candidates);
-        }
-        let tried: Vec<Validated> = candidates.iter().map(|c| validate(self.observed, *c)).collect();
+        let tried: Vec<Validated> = candidates.iter().map(|c| validate(self.observed, *c, Tags::Usual)).collect();
         let residuals: Vec<f64> = tried.iter().map(|t| t.residual).collect();
-        // Displacements of frames compensate for cut-off vessels more than positions of views do.
-        let gain = |k: usize| match candidates[k] {
-            Correction::Breathing if !self.observed.cut_off().is_empty() => choose::LARGE_GAIN,
-            _ => choose::MIN_GAIN,
-        };
+        let gain = if self.observed.cut_off().is_empty() { choose::MIN_GAIN } else { choose::LARGE_GAIN };
         let chosen = best(&residuals, gain);
+        let (mut correction, mut tags, mut validated) = (candidates[chosen], Tags::Usual, &tried[chosen]);
         let shares: Vec<_> = candidates.iter().copied().zip(residuals.iter().map(|r| r.sqrt())).collect();
-        if candidates[chosen] == Correction::Stated {
+        let wrong_tags = validate(self.observed, Correction::Static, Tags::Wrong);
+        if candidates.len() > 1 && best(&[validated.residual, wrong_tags.residual], choose::LARGE_GAIN) == 1 {
+            (correction, tags, validated) = (Correction::Static, Tags::Wrong, &wrong_tags);
             self.notes.push(format!(
-                "the views agree with the stated geometry: a correction does not reduce the residual of phases to \
-                 which it was not fitted ({})",
+                "some tags of the views are wrong by far more than usual: positions that allow for it leave {:.1} % of the profiles",
+                100.0 * wrong_tags.residual.sqrt()
+            ));
+        }
+        if correction == Correction::Stated {
+            self.notes.push(format!(
+                "the views agree with the stated geometry: a correction does not reduce the residual of planes to which it \
+                 was not fitted ({})",
                 in_words(&shares)
             ));
             return Calibration { tried: shares, notes: self.notes, ..Calibration::none(None) };
         }
-        let all: Vec<usize> = (0..self.observed.n_phases()).collect();
-        let poses = fit(self.observed, candidates[chosen], &all);
-        let [even, odd] = &tried[chosen].halves;
-        let repeatability = 0.5 * self.distance_px(even, odd);
-        self.accept(candidates[chosen], &poses, Some(repeatability), shares)
-    }
-
-    /// Chooses where there are too few phases to keep some back for a test: a correction must then reduce the residual a
-    /// lot.
-    fn without_validation(mut self, candidates: &[Correction]) -> Calibration {
-        const LARGE: f64 = 0.5;
-        self.notes.push(format!(
-            "{} phases are too few to test a correction on phases to which it was not fitted, so a correction is \
-             accepted only if it halves the residual",
-            self.observed.n_phases()
-        ));
-        let all: Vec<usize> = (0..self.observed.n_phases()).collect();
-        let share = |poses: &Poses| misfit(&self.observed.fine, poses, &all).share();
-        let stated = share(&self.stated());
-        let tried = candidates[1.min(candidates.len() - 1)];
-        let poses = fit(self.observed, tried, &all);
-        let shares = vec![(Correction::Stated, stated), (tried, share(&poses))];
-        if tried == Correction::Stated || shares[1].1 > LARGE * stated {
-            self.notes.push(format!("the stated geometry is kept ({})", in_words(&shares)));
-            return Calibration { tried: shares, notes: self.notes, ..Calibration::none(None) };
-        }
-        self.accept(tried, &poses, None, shares)
-    }
-
-    fn accept(
-        mut self,
-        correction: Correction,
-        poses: &Poses,
-        repeatability_px: Option<f64>,
-        tried: Vec<(Correction, f64)>,
-    ) -> Calibration {
-        if let Some(what) = out_of_bounds(self.observed, poses) {
+        let explains = validated.residual <= EXPLAINS * residuals[0];
+        let poses = fit(self.observed, correction, tags, &self.observed.fine.whole());
+        if let Some(what) = out_of_bounds(self.observed, &poses).filter(|_| !explains) {
             self.notes.push(format!(
                 "the views disagree, but the correction that was found is too large to be plausible ({what}), so the \
                  stated geometry is kept. Check the orientation of the images, the signs of the angles and the phases"
             ));
-            return Calibration { tried, notes: self.notes, ..Calibration::none(None) };
+            return Calibration { tried: shares, notes: self.notes, ..Calibration::none(None) };
         }
-        let explained = self.explained(poses);
-        if !self.observed.cut_off().is_empty() && !helps_clearly(correction, &tried, explained) {
-            self.notes.push(format!(
-                "the stated geometry is kept: a correction reduces the residual of the moving vessels ({}), but the \
-                 other views explain {:.0} % of a view's vessel pixels with it and {:.0} % without it",
-                in_words(&tried),
-                100.0 * explained[1],
-                100.0 * explained[0]
-            ));
-            return Calibration { tried, notes: self.notes, ..Calibration::none(None) };
-        }
-        self.described(correction, poses, repeatability_px, tried)
+        let [even, odd] = &validated.halves;
+        let repeatability = 0.5 * self.distance_px(even, odd);
+        self.described(correction, &poses, Some(repeatability), shares)
     }
 
     /// Describes poses as corrections of the views and frames.
@@ -301,8 +250,7 @@ impl Calibrator<'_> {
         let residual = |poses: &Poses| {
             let mut views = self.observed.fine.clone();
             views.pairs.retain(|p| p.views.contains(&slot));
-            let all: Vec<usize> = (0..views.n_phases).collect();
-            choose::misfit(&views, poses, &all).share()
+            choose::misfit(&views, poses, &views.whole()).share()
         };
         let before = self.stated();
         let frames = frame_rays(&self.observed.stands, slot..slot + 1, [&before, poses]);
@@ -365,15 +313,6 @@ impl Calibrator<'_> {
         let frames = self.frame_rays([a, b]);
         self.motion(a, b).remainder_px(&frames, &self.points()) * self.observed.factor as f64
     }
-}
-
-/// Tells whether a correction removes differences that cut-off vessels cannot have caused, judged by the residuals (shares
-/// of the profiles) or by the explained pixels before and after it.
-fn helps_clearly(correction: Correction, tried: &[(Correction, f64)], explained: [f64; 2]) -> bool {
-    let residual = |of: Correction| tried.iter().find(|(c, _)| *c == of).map_or(f64::NAN, |(_, share)| share * share);
-    let closer = residual(correction) <= LARGE_GAIN_LEAVES * residual(Correction::Stated);
-    closer && explained[0] < WELL_EXPLAINED && explained[1] >= explained[0] - LESS_EXPLAINED
-        || 1.0 - explained[1] <= LEFT_UNEXPLAINED * (1.0 - explained[0])
 }
 
 /// Names the first correction that exceeds the accepted bounds.
@@ -441,23 +380,5 @@ impl Calibration {
                 v.view, v.primary_deg, v.secondary_deg
             ));
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_cut_vessels_can_cause_is_no_clear_help() {
-        let helps = |residuals: [f64; 2], explained| {
-            let tried = [(Correction::Stated, residuals[0]), (Correction::Static, residuals[1])];
-            helps_clearly(Correction::Static, &tried, explained)
-        };
-        assert!(helps([1.03, 0.79], [0.88, 0.89]), "views that disagree");
-        assert!(!helps([0.765, 0.685], [0.90, 0.90]), "blades before views that agree");
-        assert!(!helps([0.82, 0.63], [0.94, 0.83]), "ends of vessels brought together");
-        assert!(!helps([0.584, 0.463], [0.974, 0.972]), "blades before views that explain each other");
-        assert!(helps([0.90, 0.85], [0.60, 0.75]), "much more is explained");
     }
 }

@@ -34,6 +34,14 @@ pub struct Pixel {
     solid: f64,
 }
 
+impl Pixel {
+    fn new(stand: &StatedView, column: f64, row: f64) -> Pixel {
+        let [d0, du, dv] = stand.rays.direction;
+        let squared = (d0 + du * column + dv * row).length_squared();
+        Pixel { column, row, squared, solid: d0.dot(du.cross(dv)).abs() / (squared * squared.sqrt()) }
+    }
+}
+
 /// Data of a view for the comparison: pixels, and the difference of each phase from the static background there.
 #[derive(Debug, Clone)]
 pub struct Moving {
@@ -50,18 +58,18 @@ pub struct Moving {
 impl Moving {
     /// Creates the data from a view's images, within `mask`.
     pub fn new(stand: StatedView, size: [usize; 2], mask: &[bool], images: &[Option<Vec<f32>>]) -> Moving {
-        let [d0, du, dv] = stand.rays.direction;
-        let area = d0.dot(du.cross(dv)).abs();
         let kept: Vec<usize> = (0..mask.len()).filter(|p| mask[*p]).collect();
-        let pixel = |p: &usize| {
-            let (column, row) = ((p % size[0]) as f64, (p / size[0]) as f64);
-            let squared = (d0 + du * column + dv * row).length_squared();
-            Pixel { column, row, squared, solid: area / (squared * squared.sqrt()) }
-        };
+        let pixel = |p: &usize| Pixel::new(&stand, (p % size[0]) as f64, (p / size[0]) as f64);
         let pixels = kept.iter().map(pixel).collect();
         let take = |image: &Vec<f32>| kept.iter().map(|p| image[*p]).collect();
         let phases = images.iter().map(|image| image.as_ref().map(take)).collect();
         Moving { stand, size, pixels, phases }
+    }
+
+    /// Returns the data as if another view had taken the images.
+    pub fn seen_from(&self, stand: StatedView) -> Moving {
+        let pixels = self.pixels.iter().map(|pixel| Pixel::new(&stand, pixel.column, pixel.row)).collect();
+        Moving { pixels, stand, ..self.clone() }
     }
 }
 
@@ -100,6 +108,8 @@ pub struct PairAtPhase {
     pub phase: usize,
     /// Pencil of planes.
     pub pencil: Pencil,
+    /// Number of the first bin, counted from the plane of angle zero.
+    pub first_bin: i64,
     /// The views' profiles.
     pub profiles: [Profile; 2],
 }
@@ -109,6 +119,41 @@ pub struct PairAtPhase {
 pub struct Pair {
     /// The two views of the pair.
     pub views: [usize; 2],
+}
+
+/// Width of the stripes of planes that are kept for a test, bins: several times the detail that the fine stages compare.
+const STRIPE: i64 = 32;
+
+/// Planes of each pencil that take part.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Planes {
+    /// All planes.
+    All,
+    /// Every second stripe, from that of angle zero on.
+    Even,
+    /// The other stripes.
+    Odd,
+}
+
+impl Planes {
+    /// Tells whether a plane takes part, by its bin counted from the plane of angle zero.
+    pub fn hold(self, bin: i64) -> bool {
+        let is_even = bin.div_euclid(STRIPE) % 2 == 0;
+        match self {
+            Planes::All => true,
+            Planes::Even => is_even,
+            Planes::Odd => !is_even,
+        }
+    }
+}
+
+/// Part of the data that is fitted or tested.
+#[derive(Debug, Clone)]
+pub struct Part {
+    /// Cardiac phases.
+    pub phases: Vec<usize>,
+    /// Planes of each pair of views.
+    pub planes: Planes,
 }
 
 /// All views that are made consistent.
@@ -182,6 +227,11 @@ impl Views {
         Views { views, pairs, n_phases, bin: pixel / BINS_PER_PIXEL }
     }
 
+    /// Returns all phases and all planes.
+    pub fn whole(&self) -> Part {
+        Part { phases: (0..self.n_phases).collect(), planes: Planes::All }
+    }
+
     /// Phases that both views of a pair have, among those wanted.
     pub fn phases_of<'a>(&'a self, pair: Pair, wanted: &'a [usize]) -> impl Iterator<Item = usize> + 'a {
         wanted.iter().copied().filter(move |t| pair.views.iter().all(|v| self.views[*v].phases[*t].is_some()))
@@ -236,7 +286,7 @@ impl Views {
                 let values = view.phases[phase].as_deref().unwrap_or_default();
                 Sums::of(view, values, &pencil, turns[k], &range, self.bin).profile(blur, self.bin)
             };
-            PairAtPhase { phase, pencil, profiles: [profile(0), profile(1)] }
+            PairAtPhase { phase, pencil, first_bin: range.start, profiles: [profile(0), profile(1)] }
         };
         phases.into_par_iter().map(at).collect()
     }

@@ -2,11 +2,11 @@
 
 use crate::calibrate::estimate::{Freedom, Normal, Unknown, Unknowns};
 use crate::calibrate::pose::Poses;
-use crate::calibrate::profiles::{Blur, Moving, Pair, PairAtPhase, Pencil, Views};
+use crate::calibrate::profiles::{Blur, Moving, Pair, PairAtPhase, Part, Pencil, Planes, Views};
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// Residual that is always expected, as a share of the profiles.
+/// Residual that is always expected, as a share of the root mean square of the profiles.
 const FLOOR: f64 = 0.02;
 /// Standard deviation of the Gaussian that a band subtracts, in standard deviations of the blur.
 const WIDE: f64 = 4.0;
@@ -36,7 +36,7 @@ impl Stage {
     }
 }
 
-/// Collects the unknowns of a stage at the wanted phases.
+/// Collects the unknowns of a stage at some phases.
 fn unknowns(views: &Views, stage: &Stage, phases: &[usize]) -> Unknowns {
     let axes = views.views.iter().map(|view| view.stand.axes()).collect();
     let shown = |view: &Moving| phases.iter().copied().filter(|t| view.phases[*t].is_some()).collect();
@@ -72,12 +72,24 @@ struct Residuals {
     power: f64,
 }
 
+/// Sets what lies in other planes to zero.
+fn keep_planes(values: &mut [f64], first_bin: i64, planes: Planes) {
+    values.iter_mut().zip(first_bin..).filter(|(_, bin)| !planes.hold(*bin)).for_each(|(value, _)| *value = 0.0);
+}
+
 fn difference(gains: [f64; 2], a: &[f64], b: &[f64]) -> Vec<f64> {
     a.iter().zip(b).map(|(a, b)| (1.0 + gains[0]) * a - (1.0 + gains[1]) * b).collect()
 }
 
 impl Residuals {
-    fn of(at: &PairAtPhase, pair: Pair, views: &Views, poses: &Poses, unknowns: &Unknowns) -> Residuals {
+    fn of(
+        at: &PairAtPhase,
+        pair: Pair,
+        views: &Views,
+        poses: &Poses,
+        unknowns: &Unknowns,
+        planes: Planes,
+    ) -> Residuals {
         let [a, b] = &at.profiles;
         let gains = pair.views.map(|v| poses.gains[v][at.phase]);
         let mut columns = Vec::new();
@@ -95,8 +107,13 @@ impl Residuals {
                 columns.push((index, scaled));
             }
         }
-        let power = a.value.iter().chain(&b.value).map(|p| p * p).sum::<f64>() / 2.0;
-        Residuals { value: difference(gains, &a.value, &b.value), columns, power }
+        let mut value = difference(gains, &a.value, &b.value);
+        let mut squares: Vec<f64> = a.value.iter().zip(&b.value).map(|(a, b)| (a * a + b * b) / 2.0).collect();
+        if planes != Planes::All {
+            let all = columns.iter_mut().map(|(_, column)| column).chain([&mut value, &mut squares]);
+            all.for_each(|values| keep_planes(values, at.first_bin, planes));
+        }
+        Residuals { value, columns, power: squares.iter().sum() }
     }
 }
 
@@ -148,11 +165,11 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 }
 
 impl PairTerms {
-    fn of(views: &Views, pair: Pair, poses: &Poses, stage: &Stage, phases: &[usize], unknowns: &Unknowns) -> PairTerms {
+    fn of(views: &Views, pair: Pair, poses: &Poses, stage: &Stage, part: &Part, unknowns: &Unknowns) -> PairTerms {
         let blur = stage.kernel();
-        let profiles = views.profiles(pair, poses, phases, &blur);
-        let residuals: Vec<Residuals> =
-            profiles.iter().map(|at| Residuals::of(at, pair, views, poses, unknowns)).collect();
+        let profiles = views.profiles(pair, poses, &part.phases, &blur);
+        let residual = |at: &PairAtPhase| Residuals::of(at, pair, views, poses, unknowns, part.planes);
+        let residuals: Vec<Residuals> = profiles.iter().map(residual).collect();
         let mut terms = PairTerms::none(unknowns);
         for r in &residuals {
             terms.add(&r.value, &r.columns, 1.0);
@@ -190,8 +207,8 @@ impl PairTerms {
     }
 
     /// Returns the sum over all pairs.
-    fn sum(views: &Views, poses: &Poses, stage: &Stage, phases: &[usize], unknowns: &Unknowns) -> PairTerms {
-        let term = |pair: &Pair| PairTerms::of(views, *pair, poses, stage, phases, unknowns);
+    fn sum(views: &Views, poses: &Poses, stage: &Stage, part: &Part, unknowns: &Unknowns) -> PairTerms {
+        let term = |pair: &Pair| PairTerms::of(views, *pair, poses, stage, part, unknowns);
         let terms: Vec<PairTerms> = views.pairs.par_iter().map(term).collect();
         terms.iter().fold(PairTerms::none(unknowns), |mut sum, PairTerms { normal, misfit }| {
             sum.normal.add_all(normal);
@@ -229,11 +246,11 @@ impl Misfit {
     }
 }
 
-/// Runs a stage's steps on the wanted phases. Poses do not change where there is no information.
-pub fn refine(views: &Views, poses: &mut Poses, stage: &Stage, phases: &[usize]) {
-    let unknowns = unknowns(views, stage, phases);
+/// Runs a stage's steps on a part of the data. Poses do not change where there is no information.
+pub fn refine(views: &Views, poses: &mut Poses, stage: &Stage, part: &Part) {
+    let unknowns = unknowns(views, stage, &part.phases);
     for _ in 0..stage.steps {
-        let PairTerms { normal, misfit } = PairTerms::sum(views, poses, stage, phases, &unknowns);
+        let PairTerms { normal, misfit } = PairTerms::sum(views, poses, stage, part, &unknowns);
         if misfit.power == 0.0 {
             return;
         }
@@ -242,12 +259,12 @@ pub fn refine(views: &Views, poses: &mut Poses, stage: &Stage, phases: &[usize])
     }
 }
 
-/// Misfit of the views at the wanted phases, with the contrasts of the frames fitted.
-pub fn misfit(views: &Views, poses: &Poses, blur: f64, phases: &[usize]) -> Misfit {
+/// Misfit of the views in a part of the data, with the contrasts of the frames fitted.
+pub fn misfit(views: &Views, poses: &Poses, blur: f64, part: &Part) -> Misfit {
     let stage = Stage { blur, band: true, steps: 2, freedom: Freedom::CONTRASTS, demean: true, temper: 1.0 };
     let mut fitted = Poses { gains: Poses::stated(views.views.len(), views.n_phases).gains, ..poses.clone() };
-    refine(views, &mut fitted, &stage, phases);
-    PairTerms::sum(views, &fitted, &stage, phases, &unknowns(views, &stage, &[])).misfit
+    refine(views, &mut fitted, &stage, part);
+    PairTerms::sum(views, &fitted, &stage, part, &unknowns(views, &stage, &[])).misfit
 }
 
 #[cfg(test)]
@@ -283,16 +300,16 @@ mod tests {
 
     fn residuals(views: &Views, pair: Pair, poses: &Poses, unknowns: &Unknowns) -> Vec<Residuals> {
         let profiles = views.profiles(pair, poses, &[0, 1, 2], &stage().kernel());
-        profiles.iter().map(|at| Residuals::of(at, pair, views, poses, unknowns)).collect()
+        profiles.iter().map(|at| Residuals::of(at, pair, views, poses, unknowns, Planes::All)).collect()
     }
 
     #[test]
     fn a_pair_has_one_profile() {
         let views = views(&ANGLES);
         assert_eq!(views.pairs.len(), 3);
-        let at_truth = misfit(&views, &Poses::stated(3, PHASES), 4.0, &[0, 1, 2]).share();
+        let at_truth = misfit(&views, &Poses::stated(3, PHASES), 4.0, &views.whole()).share();
         assert!(at_truth < 0.002, "{at_truth}");
-        let apart = misfit(&views, &off(3), 4.0, &[0, 1, 2]).share();
+        let apart = misfit(&views, &off(3), 4.0, &views.whole()).share();
         assert!(apart > 0.02, "{apart}");
     }
 

@@ -29,7 +29,7 @@ impl Sharpness {
 pub struct PairAgreement {
     /// The views, by their index among those that show motion.
     pub views: [usize; 2],
-    /// Squared difference of their profiles, as a share of their squares: 0 for one object, about 1 for two unrelated ones.
+    /// Squared difference of their profiles at equal contrast, as a share of their squares: 0 for one object, about 1 for two unrelated ones.
     pub residual: f64,
     /// Share of the squares of their profiles that varies over the phases. Vessels that move within the planes through both
     /// sources change nothing in the profiles, whose difference is then no evidence.
@@ -58,15 +58,19 @@ fn parts(phases: &[PairAtPhase]) -> SquareSums {
     let mean = |side: usize, bin: usize| {
         phases.iter().map(|at| at.profiles[side].value[bin]).sum::<f64>() / phases.len() as f64
     };
-    let mut sum = (0.0, 0.0);
+    let (mut product, mut squares) = (0.0, [0.0; 2]);
     for bin in 0..first.profiles[0].value.len() {
         let means = [mean(0, bin), mean(1, bin)];
         for at in phases {
             let [a, b] = [0, 1].map(|side| at.profiles[side].value[bin] - means[side]);
-            sum = (sum.0 + (a - b) * (a - b), sum.1 + a * a + b * b);
+            product += a * b;
+            squares = [squares[0] + a * a, squares[1] + b * b];
         }
     }
-    sum
+    // Runs differ in contrast: profiles are compared at equal squares.
+    let both = squares[0] + squares[1];
+    let alike = product / (squares[0] * squares[1]).sqrt().max(f64::MIN_POSITIVE);
+    ((1.0 - alike) * both, both)
 }
 
 fn share(parts: impl Iterator<Item = SquareSums>) -> f64 {
@@ -82,16 +86,23 @@ pub struct Comparison {
 }
 
 impl Comparison {
-    /// Compares all pairs at all phases both views have.
+    /// Compares all pairs at all phases both views have, with the geometry as stated.
     pub fn of(views: &Views, look: Sharpness) -> Comparison {
-        let by_pair = views.pairs.par_iter().map(|pair| compare(views, *pair, look)).collect();
+        Comparison::at(views, &Poses::stated(views.views.len(), views.n_phases), look)
+    }
+
+    /// Compares all pairs at other poses.
+    pub fn at(views: &Views, poses: &Poses, look: Sharpness) -> Comparison {
+        let by_pair = views.pairs.par_iter().map(|pair| compare(views, poses, *pair, look)).collect();
         Comparison { look, by_pair }
     }
 
-    /// Returns the comparison after a change of one view: only its pairs are compared again.
-    pub fn after_change(&self, views: &Views, changed: usize) -> Comparison {
+    /// Returns the comparison after a change of some views: only their pairs are compared again.
+    pub fn after_change(&self, views: &Views, changed: &[usize]) -> Comparison {
+        let stated = Poses::stated(views.views.len(), views.n_phases);
         let again = |(pair, before): (&Pair, &SquareSums)| {
-            if pair.views.contains(&changed) { compare(views, *pair, self.look) } else { *before }
+            let is_changed = pair.views.iter().any(|view| changed.contains(view));
+            if is_changed { compare(views, &stated, *pair, self.look) } else { *before }
         };
         Comparison { look: self.look, by_pair: views.pairs.par_iter().zip(&self.by_pair).map(again).collect() }
     }
@@ -101,16 +112,25 @@ impl Comparison {
         share(self.by_pair.iter().copied())
     }
 
+    /// Returns the views that disagree with at least half of the views with which they are compared: the residual of the pair exceeds `limit`.
+    pub fn suspects(&self, views: &Views, limit: f64) -> Vec<usize> {
+        let is_suspect = |view: &usize| {
+            let of_view = views.pairs.iter().zip(&self.by_pair).filter(|(pair, _)| pair.views.contains(view));
+            let disagree: Vec<bool> = of_view.map(|(_, parts)| share(std::iter::once(*parts)) > limit).collect();
+            2 * disagree.iter().filter(|disagrees| **disagrees).count() >= disagree.len().max(1)
+        };
+        (0..views.views.len()).filter(is_suspect).collect()
+    }
+
     /// Squared difference of the profiles of some pairs, as a share of their squares.
     fn residual_of(&self, judged: &[bool]) -> f64 {
         share(self.by_pair.iter().zip(judged).filter(|(_, judged)| **judged).map(|(parts, _)| *parts))
     }
 }
 
-fn compare(views: &Views, pair: Pair, look: Sharpness) -> SquareSums {
-    let poses = Poses::stated(views.views.len(), views.n_phases);
+fn compare(views: &Views, poses: &Poses, pair: Pair, look: Sharpness) -> SquareSums {
     let phases: Vec<usize> = (0..views.n_phases).collect();
-    parts(&views.profiles(pair, &poses, &phases, &look.blur()))
+    parts(&views.profiles(pair, poses, &phases, &look.blur()))
 }
 
 /// Share of the squares of a pair's profiles that varies over the phases both views have.

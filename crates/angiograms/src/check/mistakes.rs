@@ -1,5 +1,7 @@
 //! The usual mistakes in a dataset, and how to undo them.
 
+use crate::calibrate::observed::Observed;
+use crate::calibrate::pose::StatedView;
 use crate::calibrate::profiles::Views;
 use crate::geometry::{CArm, Geometry};
 use crate::scan::canvas::{framed, onto_canvas};
@@ -182,15 +184,14 @@ impl PhaseMistake {
     }
 }
 
-/// Exchanges the geometries of two views; `None` where one is impossible for the other's images.
-pub fn exchanged(dataset: &Dataset, [a, b]: [usize; 2]) -> Option<Dataset> {
-    let mut changed = dataset.clone();
-    changed.views.swap(a, b);
-    for view in [a, b] {
-        let size = dataset.views[view].size;
-        if changed.views[view].size != size {
-            changed.views[view] = View::new(changed.views[view].geometry.clone(), size).ok()?;
-        }
+/// Exchanges the geometries of two observed views; `None` where one is impossible for the other's images.
+pub fn exchanged(dataset: &Dataset, observed: &Observed, views: &Views, [a, b]: [usize; 2]) -> Option<Views> {
+    let mut changed = views.clone();
+    for (slot, of) in [(a, b), (b, a)] {
+        let [own, other] = [slot, of].map(|slot| &dataset.views[observed.views[slot]]);
+        let view = View::new(other.geometry.clone(), own.size).ok()?;
+        let stand = StatedView::new(&view.geometry, &view.rays.binned(observed.factor));
+        changed.views[slot] = views.views[slot].seen_from(stand);
     }
     Some(changed)
 }

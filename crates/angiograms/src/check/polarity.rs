@@ -1,22 +1,19 @@
 //! Whether vessels are brighter than what surrounds them, as line integrals are, or darker, as in intensities.
 
 use crate::calibrate::observed::binned_series;
+use crate::evidence::background::{OPENING_SHARE, STRONGEST_BLUR};
 use crate::evidence::series::{Series, blur, opening_radius};
 use crate::raster::{Image, opening};
 use crate::scan::dataset::Dataset;
 use rayon::prelude::*;
 
-/// Radius of the opening that removes vessels, as a share of an image's smaller side.
-const VESSEL_SHARE: f64 = 0.03;
-/// Blur against noise, pixels.
-const NOISE_BLUR: f32 = 0.7;
 /// Share of the change of narrow structures by which dark ones must exceed bright ones: narrow gaps between bright vessels are
 /// dark.
 const CLEARLY: f64 = 0.2;
 
 /// Narrow parts of an image that are brighter than their surroundings, and those that are darker.
 fn narrow_parts(image: &Image, radius: usize) -> [Vec<f32>; 2] {
-    let image = blur(image, NOISE_BLUR);
+    let image = blur(image, STRONGEST_BLUR);
     let negative = Image { values: image.values.iter().map(|v| -v).collect(), ..image.clone() };
     [image, negative].map(|image| {
         let wide = opening(&image, radius);
@@ -29,7 +26,7 @@ fn narrow_parts(image: &Image, radius: usize) -> [Vec<f32>; 2] {
 fn changes(series: &Series) -> [f64; 2] {
     let images: Vec<&Image> = series.seen().collect();
     let Some(first) = images.first() else { return [0.0; 2] };
-    let radius = opening_radius(VESSEL_SHARE, first.width, first.height);
+    let radius = opening_radius(OPENING_SHARE, first.width, first.height);
     let parts: Vec<[Vec<f32>; 2]> = images.par_iter().map(|image| narrow_parts(image, radius)).collect();
     [0, 1].map(|part| {
         let variance = |pixel: usize| {

@@ -2,17 +2,14 @@
 //! reconstruction from corrected views is displaced by one against the truth. Where `truth.json` states the true geometry
 //! of the images, that motion is found and applied to unseen views and true vessels.
 
-use crate::calibrate::gauge::{FrameRays, RigidMotion, common_motion};
+use crate::calibrate::gauge::{FrameRays, RigidMotion, common_motion, heart_points};
 use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
-use crate::scan::dataset::{Dataset, Frame, Split, View};
+use crate::scan::dataset::{Dataset, Frame, Split};
 use crate::scan::truth::{TRUTH, TrueFrame, Truth};
 use glam::DVec3;
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
-
-/// Half side of the cube of points that represent the heart, as a share of half the field of view.
-const HEART_SHARE: f64 = 0.5;
 
 /// True rays of a frame's image, with the heart at its mean position.
 pub(super) fn true_rays(frame: &TrueFrame, view: usize, dataset: &Dataset) -> Result<ViewRays> {
@@ -26,13 +23,9 @@ pub(super) fn shift_of(frame: &TrueFrame) -> DVec3 {
     DVec3::from_array(frame.heart_shift_mm) / MM_PER_UNIT
 }
 
-/// Points that represent the heart: the corners and the centre of a cube.
+/// Points that represent the heart of a dataset.
 fn points(dataset: &Dataset) -> Vec<DVec3> {
-    let View { rays, size: [width, height], .. } = &dataset.views[0];
-    let pixel = rays.anchor[1].length().min(rays.anchor[2].length());
-    let half = HEART_SHARE * 0.5 * pixel * *width.min(height) as f64;
-    let sign = |k: usize, axis: usize| if k >> axis & 1 == 1 { half } else { -half };
-    (0..8).map(|k| DVec3::new(sign(k, 0), sign(k, 1), sign(k, 2))).chain([DVec3::ZERO]).collect()
+    heart_points(&dataset.views[0].rays, dataset.views[0].size)
 }
 
 /// Displacements up to this have no influence on scores, pixels.
