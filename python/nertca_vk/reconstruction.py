@@ -695,7 +695,7 @@ class Reconstruction:
         true vessels, where `set_true_vessels` or `set_true_tree` said where they are.
 
         threshold_per_mm: attenuation above which the dynamic field counts as vessel; 0 for a fifth of
-        `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
+        `vessel_attenuation_per_mm`, or of the strongest attenuation of the field where that is unknown.
 
         Raises DataError without such frames; NotReadyError before anything was trained or loaded.
         """

@@ -4,7 +4,7 @@
 mod displacement;
 mod rhythm;
 
-use crate::evidence::lines::{self as evidence, SteadyFrame, line_strength, over_frames, thin_structures};
+use crate::evidence::lines::{self as evidence, SteadyFrame, Thin, line_strength, over_frames, thin_structures};
 use crate::raster::{Image, dilate, median, percentile};
 use displacement::{displacements, moved, robust_deviation, shown_by_all};
 use rayon::prelude::*;
@@ -62,9 +62,14 @@ impl Cine {
         };
         let places: Vec<[f32; 2]> = near.iter().map(|frame| displacements[*frame]).collect();
         let all = shown_by_all(&shown, size, &places);
-        let unmoved: Vec<Image> = frames.par_iter().map(|frame| thin_structures(frame, mm)).collect();
-        let thin = of_near(&unmoved);
-        let of_contrast = contrast(&thin, &all);
+        let (unmoved, sharp): (Vec<Image>, Vec<Image>) = frames
+            .par_iter()
+            .map(|frame| {
+                let Thin { smooth, sharp } = thin_structures(frame, mm);
+                (smooth, sharp)
+            })
+            .unzip();
+        let of_contrast = contrast(&of_near(&unmoved), &all);
         let mut contrast = vec![0.0; frames.len()];
         near.iter().zip(of_contrast).for_each(|(frame, of)| contrast[*frame] = of);
         let arrived = contrast.iter().position(|c| *c > ARRIVED).unwrap_or(0);
@@ -73,7 +78,7 @@ impl Cine {
         let rhythm =
             similarity.rhythm(injected, frames_per_s).or_else(|| similarity.rhythm(0..frames.len(), frames_per_s));
         let lines = of_near(&frames.par_iter().map(|frame| line_strength(frame, mm)).collect::<Vec<_>>());
-        let steady = near.iter().zip(lines.into_iter().zip(thin));
+        let steady = near.iter().zip(lines.into_iter().zip(of_near(&sharp)));
         let steady: Vec<SteadyFrame> =
             steady.map(|(number, (lines, thin))| SteadyFrame { thin, lines, contrast: contrast[*number] }).collect();
         let found = evidence::vessels(&steady, &all, mm);

@@ -121,7 +121,7 @@ unsafe fn copied<T: Copy>(name: &str, from: *const T, count: usize) -> Outcome<V
 
 /// Scores the frames that were added with `NERTCA_SPLIT_VALIDATION` (at least one is required), and compares the reconstruction
 /// with the true vessels where these are known. `threshold_per_mm` is the attenuation from which the dynamic field counts as
-/// vessel; 0 selects a fifth of `vessel_attenuation_per_mm`, or Otsu's threshold where that is unknown. Callable from any
+/// vessel; 0 selects a fifth of `vessel_attenuation_per_mm`, or of the strongest attenuation of the field where that is unknown. Callable from any
 /// thread, also during training. A library of an earlier version does not write fields that it does not know: set them to NaN
 /// before the call if the version may be older. Live pictures pass meanwhile.
 ///

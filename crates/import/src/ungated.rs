@@ -3,7 +3,7 @@
 use crate::dicom::Run;
 use crate::error::{Error, Result};
 use crate::geometry::{CArm, Geometry, ViewRays, lps_mm_from_world};
-use crate::raster::{Image, median};
+use crate::raster::Image;
 use crate::scan::gating::BeatTime;
 use glam::DVec3;
 use nertca_vk_angiograms::calibrate::runs::{Aligned, Beating, PairAgreement, STEPS, align};
@@ -14,17 +14,24 @@ use std::ops::{Range, RangeInclusive};
 pub(super) const SIDE: usize = 256;
 /// Largest accepted number of frames of a run: 20 s at 15 per second.
 const MAX_FRAMES: usize = 300;
-/// Bound of line integrals of vessels, in units of their median: where vessels overlap, and in the catheter, values say less of how much
-/// there is than of where. Without a bound, simulated runs have a Dice of .556 instead of .594 (docs/tried.md).
-const SATURATION: f32 = 2.0;
+/// Angle to a plane within which views count as looking along it, degrees: a displacement of 5 mm in the plane then moves profiles by less
+/// than .5 mm, a pixel.
+const ONE_PLANE_DEG: f64 = 5.0;
 
 /// Place of a run in the common beat, and in the room.
-#[derive(Default)]
 pub(super) struct Placed {
     /// Step of the run's own beat that is step 0 of the common one.
     first_step: usize,
     /// Displacement of the patient, LPS, mm.
     table_mm: DVec3,
+    /// Factor on the size of its pixels.
+    scale: f64,
+}
+
+impl Default for Placed {
+    fn default() -> Placed {
+        Placed { first_step: 0, table_mm: DVec3::ZERO, scale: 1.0 }
+    }
 }
 
 /// The beat of a run that is used.
@@ -144,7 +151,9 @@ impl OneBeat {
     /// C-arm of all images of a run at its place.
     pub(super) fn c_arm(&self, placed: &Placed) -> CArm {
         let sum: DVec3 = DVec3::from_array(self.c_arm.table_mm) + placed.table_mm;
-        CArm { table_mm: sum.to_array(), ..self.c_arm.clone() }
+        let scaled = |mm: [f64; 2]| mm.map(|mm| mm * placed.scale);
+        let (pixel_mm, offset_mm) = (scaled(self.c_arm.pixel_mm), scaled(self.c_arm.offset_mm));
+        CArm { table_mm: sum.to_array(), pixel_mm, offset_mm, ..self.c_arm.clone() }
     }
 
     /// Images at whole phases of the common beat, each the frame nearest to its phase.
@@ -159,11 +168,10 @@ impl OneBeat {
                 *slot = Some((taken, frame));
             }
         }
-        let bound = bound(&self.vessels);
         let image = |(taken, frame): (BeatTime, usize)| BeatImage {
             taken,
             frame: self.frames.start + frame,
-            image: saturated(&self.vessels[frame], bound),
+            image: self.vessels[frame].clone(),
         };
         nearest.into_iter().flatten().map(image).collect()
     }
@@ -178,8 +186,23 @@ impl OneBeat {
 /// Places runs in a common beat and in the room; returns notes for the user as well. `names` are those of the runs.
 pub(super) fn place(runs: &[&OneBeat], names: &[String]) -> (Vec<Placed>, Vec<String>) {
     let beating: Vec<Beating<'_>> = runs.iter().map(|run| Beating { rays: &run.rays, steps: run.steps() }).collect();
-    let Aligned { first_step, displaced, pairs } = align(&beating);
-    let placed = |run: usize| Placed { first_step: first_step[run], table_mm: lps_mm_from_world(displaced[run]) };
+    let Aligned { first_step, scale, displaced, pairs } = align(&beating);
+    let placed = |run: usize| Placed {
+        first_step: first_step[run],
+        table_mm: lps_mm_from_world(displaced[run]),
+        scale: scale[run],
+    };
+    let scaled = (0..runs.len()).filter(|run| (scale[*run] - 1.0).abs() > 1e-9).map(|run| {
+        format!(
+            "{}: its vessels are {:.0} % {} than in the other runs, so that its distances or its pixel size are wrong; the pixel size was \
+             corrected. The mean size of the runs stays as stated",
+            names[run],
+            100.0 * (scale[run] - 1.0).abs(),
+            if scale[run] > 1.0 { "smaller" } else { "larger" }
+        )
+    });
+    let mut first_notes: Vec<String> = scaled.collect();
+    first_notes.extend(in_one_plane(&runs.iter().map(|run| run.rays.axis()).collect::<Vec<_>>()));
     let note = |pair: &PairAgreement| {
         let [a, b] = pair.runs;
         format!(
@@ -193,7 +216,20 @@ pub(super) fn place(runs: &[&OneBeat], names: &[String]) -> (Vec<Placed>, Vec<St
             100.0 * (first_step[b] as f64 - first_step[a] as f64).rem_euclid(STEPS as f64) / STEPS as f64
         )
     };
-    ((0..runs.len()).map(placed).collect(), pairs.iter().map(note).collect())
+    ((0..runs.len()).map(placed).collect(), first_notes.into_iter().chain(pairs.iter().map(note)).collect())
+}
+
+/// Returns a note where three or more views look along directions in one plane.
+fn in_one_plane(directions: &[DVec3]) -> Option<String> {
+    let pairs = directions.iter().enumerate().flat_map(|(k, b)| directions[..k].iter().map(|a| a.cross(*b)));
+    let normal = pairs.max_by(|a, b| a.length().total_cmp(&b.length()))?.try_normalize()?;
+    let out_deg = directions.iter().map(|d| d.dot(normal).abs().asin().to_degrees()).fold(0.0, f64::max);
+    (directions.len() > 2 && out_deg < ONE_PLANE_DEG).then(|| {
+        format!(
+            "all views look along directions within {out_deg:.1} degrees of one plane: no pair of them shows a displacement of the patient \
+             within this plane between the runs. A run from outside of the plane, such as a steep cranial or caudal one, decides it"
+        )
+    })
 }
 
 /// C-arm of a part of an image.
@@ -210,14 +246,19 @@ fn part(image: &Image, columns: &Range<usize>, rows: &Range<usize>) -> Image {
     Image { width: columns.len(), height: rows.len(), values }
 }
 
-/// Largest line integral of vessels that is kept: twice their median.
-fn bound(vessels: &[Image]) -> f32 {
-    let mut positive: Vec<f32> = vessels.iter().flat_map(|image| &image.values).copied().filter(|v| *v > 0.0).collect();
-    SATURATION * median(&mut positive)
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
 
-/// Limits line integrals smoothly.
-fn saturated(image: &Image, bound: f32) -> Image {
-    let values = image.values.iter().map(|v| if bound > 0.0 { bound * (v / bound).tanh() } else { *v }).collect();
-    Image { values, ..*image }
+    #[test]
+    fn views_in_one_plane_are_told() {
+        let at = |degrees: f64, above: f64| {
+            let (sin, cos) = degrees.to_radians().sin_cos();
+            DVec3::new(cos, sin, above).normalize()
+        };
+        let note = |last: DVec3| in_one_plane(&[at(-40.0, 0.0), at(20.0, 0.0), last]);
+        assert!(note(at(50.0, 0.03)).is_some_and(|note| note.contains("of one plane")));
+        assert_eq!(note(at(50.0, 0.4)), None);
+        assert_eq!(in_one_plane(&[at(-40.0, 0.0), at(20.0, 0.0)]), None, "two views always do");
+    }
 }

@@ -49,7 +49,7 @@ impl Score {
         let (heading, meaning, digits, more_is_better) = match self {
             Score::Dice => {
                 let meaning = "dynamic field on all unseen images, thresholded at a fifth of the stated attenuation of \
-                               vessels (at Otsu's threshold where none is stated, at 0.05 for X-Gaussian's opacities)";
+                               vessels (of the strongest attenuation where none is stated, at 0.05 for X-Gaussian's opacities)";
                 ("Dice", meaning, 3, true)
             }
             Score::DiceTotal => ("Dice, total", "both fields, otherwise like Dice", 3, true),

@@ -129,7 +129,8 @@ const LARGE_SIDE: usize = 300;
 fn wide_hull(soft: &SoftMotion, dataset: &Dataset) -> Option<String> {
     (soft.hull.share() > WIDE_HULL).then(|| {
         let mut note = "that is far more than vessels fill: the views may not show the same object (`check` tells), only two views may \
-                        be given, or much more than vessels may move; each iteration takes the longer, the more the hull keeps"
+                        be given, or much more than vessels may move, as where the table was panned (`import --gate-by-images` removes that); each \
+                        iteration takes the longer, the more the hull keeps"
             .to_owned();
         if dataset.width.max(dataset.height) > LARGE_SIDE {
             note += "; images of half the width and height take about a quarter of the time";

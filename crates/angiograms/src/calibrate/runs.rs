@@ -36,6 +36,14 @@ const MIN_LEAD: f64 = 0.01;
 const UNDETERMINED: f64 = 4e-4;
 /// Penalty on the displacements of runs, in correlation per mm^2.
 const SMALL_PER_MM2: f64 = 2e-4;
+/// Ratio between neighbouring scales of a run that are tried, as a logarithm: 2 %.
+const SCALE_STEP: f64 = 0.02;
+/// Number of steps to larger and to smaller scales that are tried: distances that are assumed are wrong by up to 16 %.
+const SCALE_REACH: i32 = 8;
+/// Penalty on the scale of a run, in correlation per squared step.
+const SCALE_PENALTY: f64 = 5e-4;
+/// Mean gain in correlation of the pairs from which runs are scaled: chance gains less where distances are right.
+const SCALE_GAIN: f64 = 0.03;
 /// Steps of the search for the displacements of three and more runs, mm.
 const SEARCH_MM: [f64; 6] = [8.0, 4.0, 2.0, 1.0, 0.5, 0.25];
 
@@ -65,6 +73,8 @@ pub struct PairAgreement {
 pub struct Aligned {
     /// For each run, the step of its own that shows the state of the heart of step 0 of the first run.
     pub first_step: Vec<usize>,
+    /// For each run, the factor on the size of its pixels that makes vessels as large as in the other runs; 1 where the stated sizes agree.
+    pub scale: Vec<f64>,
     /// For each run, the displacement of the patient, world units.
     pub displaced: Vec<DVec3>,
     /// Pairs of runs that constrain each other.
@@ -80,6 +90,7 @@ struct Pair {
 }
 
 /// Integrals of a frame over planes, and the bins that its images cover.
+#[derive(Clone)]
 struct Profile {
     values: Vec<f64>,
     covered: std::ops::Range<usize>,
@@ -94,12 +105,13 @@ fn reach() -> usize {
 
 /// Aligns runs; one run is as it is.
 pub fn align(runs: &[Beating<'_>]) -> Aligned {
-    let pairs: Vec<Pair> =
+    let mut pairs: Vec<Pair> =
         (0..runs.len()).flat_map(|b| (0..b).map(move |a| [a, b])).filter_map(|pair| Pair::new(pair, runs)).collect();
-    let mut first_step = vec![0; runs.len()];
-    for run in 1..runs.len() {
-        first_step[run] = best_first_step(run, &pairs, &first_step);
+    let scale = scales(runs.len(), &pairs);
+    if scale.iter().any(|scale| *scale != 1.0) {
+        pairs = pairs.into_iter().map(|pair| pair.scaled(&scale)).collect();
     }
+    let first_step = first_steps(runs.len(), &pairs);
     let means: Vec<Curve> = pairs.par_iter().map(|pair| mean(&pair.curves(&first_step))).collect();
     let displaced = displacements(runs.len(), &pairs, &means);
     let agreement = |(pair, curve): (&Pair, &Curve)| PairAgreement {
@@ -110,6 +122,7 @@ pub fn align(runs: &[Beating<'_>]) -> Aligned {
     };
     Aligned {
         first_step,
+        scale,
         pairs: pairs.iter().zip(&means).map(agreement).collect(),
         displaced: displaced.into_iter().map(|d| d / MM_PER_UNIT).collect(),
     }
@@ -142,6 +155,35 @@ impl Pair {
         self.normal.dot(displaced[self.runs[0]] - displaced[self.runs[1]])
     }
 
+    /// Returns the pair with other scales of the runs.
+    fn scaled(self, scale: &[f64]) -> Pair {
+        let [a, b] = self.runs;
+        let [of_a, of_b] = self.profiles;
+        let all = |of: Vec<Profile>, by: f64| of.iter().map(|profile| profile.scaled(by)).collect();
+        Pair { profiles: [all(of_a, scale[a]), all(of_b, scale[b])], ..self }
+    }
+
+    /// Mean over the beat of the highest correlations near a common displacement, where the runs begin at these steps.
+    fn rate(&self, [a, b]: [usize; 2]) -> f64 {
+        let window = (WITHIN_BEAT_MM / BIN_MM) as usize;
+        let [of_a, of_b] = &self.profiles;
+        let at = |step: usize| curve(&of_a[(step + a) % STEPS], &of_b[(step + b) % STEPS], 2);
+        let curves: Vec<Curve> = (0..STEPS).map(at).collect();
+        let total = mean(&curves);
+        let best = (0..total.len()).max_by(|a, b| total[*a].total_cmp(&total[*b])).unwrap_or_default();
+        let around = best.saturating_sub(window)..(best + window + 1).min(total.len());
+        let highest = |curve: &Curve| curve[around.clone()].iter().copied().fold(-1.0, f64::max);
+        curves.iter().map(highest).sum::<f64>() / STEPS as f64
+    }
+
+    /// Highest rate, at whichever steps the runs begin, with the second run scaled.
+    fn peak(&self, by: f64) -> f64 {
+        let [of_a, of_b] = &self.profiles;
+        let of_b = of_b.iter().map(|profile| profile.scaled(by)).collect();
+        let scaled = Pair { runs: self.runs, normal: self.normal, profiles: [of_a.clone(), of_b] };
+        (0..STEPS).into_par_iter().map(|first| scaled.rate([0, first])).reduce(|| -1.0, f64::max)
+    }
+
     /// Correlations at each step of the common beat.
     fn curves(&self, first_step: &[usize]) -> Vec<Curve> {
         let [a, b] = self.runs.map(|run| first_step[run]);
@@ -168,6 +210,24 @@ impl Profile {
         }
         let [fine, wide] = BAND_MM.map(|length| blurred(&values, length / BIN_MM));
         Profile { values: fine.iter().zip(&wide).map(|(fine, wide)| fine - wide).collect(), covered }
+    }
+}
+
+impl Profile {
+    /// Returns the profile of an image whose pixels are larger by a factor: it is stretched about the plane through the isocentre.
+    fn scaled(&self, by: f64) -> Profile {
+        let n = self.values.len();
+        let middle = REACH_MM / BIN_MM;
+        let value = |k: usize| {
+            let from = (k as f64 - middle) / by + middle;
+            if !(0.0..(n - 1) as f64).contains(&from) {
+                return 0.0;
+            }
+            let low = from as usize;
+            self.values[low] + from.fract() * (self.values[low + 1] - self.values[low])
+        };
+        let end = |at: usize| ((at as f64 - middle) * by + middle).clamp(0.0, n as f64) as usize;
+        Profile { values: (0..n).map(value).collect(), covered: end(self.covered.start)..end(self.covered.end) }
     }
 }
 
@@ -236,25 +296,64 @@ impl Peak {
     }
 }
 
+/// Finds the first step of each run, one after the other.
+fn first_steps(n: usize, pairs: &[Pair]) -> Vec<usize> {
+    let mut first_step = vec![0; n];
+    for run in 1..n {
+        first_step[run] = best_first_step(run, pairs, &first_step);
+    }
+    first_step
+}
+
+/// Finds the scales of the runs at which the pairs together correlate best; 1 for all where the gain is small. The mean of their logarithms is
+/// 0, because pairs of runs tell ratios alone.
+fn scales(n: usize, pairs: &[Pair]) -> Vec<f64> {
+    let factor = |steps: f64| (SCALE_STEP * steps).exp();
+    // `[pair][step]`: highest correlation by the ratio of the scales.
+    let table: Vec<Vec<f64>> = pairs
+        .iter()
+        .map(|pair| {
+            let ratios = -SCALE_REACH..=SCALE_REACH;
+            ratios.map(|step| pair.peak(factor(f64::from(step)))).collect()
+        })
+        .collect();
+    let agreement = |steps: &[i32]| -> f64 {
+        let of_pair = |(pair, peaks): (&Pair, &Vec<f64>)| {
+            let ratio = steps[pair.runs[1]] - steps[pair.runs[0]];
+            peaks.get((ratio + SCALE_REACH) as usize).copied().unwrap_or(-1.0)
+        };
+        pairs.iter().zip(&table).map(of_pair).sum()
+    };
+    let rated =
+        |steps: &[i32]| agreement(steps) - SCALE_PENALTY * steps.iter().map(|step| f64::from(step * step)).sum::<f64>();
+    let mut steps = vec![0; n];
+    loop {
+        let before = steps.clone();
+        for run in 0..n {
+            let with = |step: i32| steps.iter().enumerate().map(|(k, s)| if k == run { step } else { *s }).collect();
+            let tried: Vec<Vec<i32>> = (-SCALE_REACH..=SCALE_REACH).map(with).collect();
+            let better = tried.into_iter().filter(|tried| rated(tried) > rated(&steps) + f64::EPSILON);
+            steps = better.max_by(|a, b| rated(a).total_cmp(&rated(b))).unwrap_or(steps);
+        }
+        if steps == before {
+            break;
+        }
+    }
+    if agreement(&steps) - agreement(&vec![0; n]) < SCALE_GAIN * pairs.len() as f64 {
+        return vec![1.0; n];
+    }
+    let mean = f64::from(steps.iter().sum::<i32>()) / n as f64;
+    steps.into_iter().map(|step| factor(f64::from(step) - mean)).collect()
+}
+
 /// Step of a run at which it agrees best with the runs before it, each at its own step.
 fn best_first_step(run: usize, pairs: &[Pair], first_step: &[usize]) -> usize {
     if !pairs.iter().any(|pair| pair.runs[1] == run) {
         return 0;
     }
-    let window = (WITHIN_BEAT_MM / BIN_MM) as usize;
     let rate = |first: usize| -> f64 {
-        let with = pairs.iter().filter(|pair| pair.runs[1] == run).map(|pair| {
-            let [of_a, of_b] = &pair.profiles;
-            let a = first_step[pair.runs[0]];
-            let at = |step: usize| curve(&of_a[(step + a) % STEPS], &of_b[(step + first) % STEPS], 2);
-            let curves: Vec<Curve> = (0..STEPS).map(at).collect();
-            let total = mean(&curves);
-            let best = (0..total.len()).max_by(|a, b| total[*a].total_cmp(&total[*b])).unwrap_or_default();
-            let around = best.saturating_sub(window)..(best + window + 1).min(total.len());
-            let highest = |curve: &Curve| curve[around.clone()].iter().copied().fold(-1.0, f64::max);
-            curves.iter().map(highest).sum::<f64>() / STEPS as f64
-        });
-        with.sum()
+        let with = pairs.iter().filter(|pair| pair.runs[1] == run);
+        with.map(|pair| pair.rate([first_step[pair.runs[0]], first])).sum()
     };
     let rated: Vec<f64> = (0..STEPS).into_par_iter().map(rate).collect();
     (0..STEPS).max_by(|a, b| rated[*a].total_cmp(&rated[*b])).unwrap_or_default()
@@ -339,8 +438,8 @@ mod tests {
 
     const SIZE: usize = 96;
 
-    fn rays(primary_deg: f64, secondary_deg: f64) -> ViewRays {
-        let c_arm = CArm {
+    fn c_arm(primary_deg: f64, secondary_deg: f64) -> CArm {
+        CArm {
             primary_deg,
             secondary_deg,
             sid_mm: 1000.0,
@@ -348,8 +447,11 @@ mod tests {
             pixel_mm: [1.4; 2],
             offset_mm: [0.0; 2],
             table_mm: [0.0; 3],
-        };
-        Geometry::CArm(c_arm).rays(SIZE, SIZE).unwrap()
+        }
+    }
+
+    fn rays(primary_deg: f64, secondary_deg: f64) -> ViewRays {
+        Geometry::CArm(c_arm(primary_deg, secondary_deg)).rays(SIZE, SIZE).unwrap()
     }
 
     /// Vessels as rows of points on three arcs that beat, LPS mm.
@@ -363,6 +465,27 @@ mod tests {
             DVec3::new(radius * angle.cos(), radius * angle.sin(), 25.0 - 60.0 * along + 9.0 * arc + 3.0 * twist)
         };
         (0..3).flat_map(|arc| (0..60).map(move |i| point(arc, i))).collect()
+    }
+
+    #[test]
+    fn runs_of_wrong_distances_are_scaled() {
+        let views = [(-30.0, 20.0), (50.0, 0.0), (5.0, 40.0)].map(|(primary, secondary)| rays(primary, secondary));
+        let taken: Vec<Vec<Image>> =
+            views.iter().zip([0.0, 0.35, 0.8]).map(|(rays, begins)| images(rays, begins, DVec3::ZERO)).collect();
+        // The stated pixels of the second run are too small by a tenth.
+        let small = CArm { pixel_mm: [1.4 / 1.1; 2], ..c_arm(50.0, 0.0) };
+        let small = Geometry::CArm(small).rays(SIZE, SIZE).unwrap();
+        let aligned = |second: &ViewRays| {
+            let rays = [&views[0], second, &views[2]];
+            let beating = rays.into_iter().zip(&taken);
+            align(&beating.map(|(rays, images)| Beating { rays, steps: images.iter().collect() }).collect::<Vec<_>>())
+        };
+        assert_eq!(aligned(&views[1]).scale, [1.0; 3], "right distances");
+        let found = aligned(&small).scale;
+        for other in [0, 2] {
+            let ratio = found[1] / found[other];
+            assert!((ratio - 1.1).abs() < 0.025, "{found:?}");
+        }
     }
 
     /// Images of a beat that begins at a fraction of it, of a patient who is displaced, LPS mm.

@@ -29,7 +29,7 @@ impl Sharpness {
 pub struct PairAgreement {
     /// The views, by their index among those that show motion.
     pub views: [usize; 2],
-    /// Squared difference of their profiles at equal contrast, as a share of their squares: 0 for one object, about 1 for two unrelated ones.
+    /// Squared difference of their profiles, as a share of their squares: 0 for one object, about 1 for two unrelated ones.
     pub residual: f64,
     /// Share of the squares of their profiles that varies over the phases. Vessels that move within the planes through both
     /// sources change nothing in the profiles, whose difference is then no evidence.
@@ -58,19 +58,15 @@ fn parts(phases: &[PairAtPhase]) -> SquareSums {
     let mean = |side: usize, bin: usize| {
         phases.iter().map(|at| at.profiles[side].value[bin]).sum::<f64>() / phases.len() as f64
     };
-    let (mut product, mut squares) = (0.0, [0.0; 2]);
+    let mut sum = (0.0, 0.0);
     for bin in 0..first.profiles[0].value.len() {
         let means = [mean(0, bin), mean(1, bin)];
         for at in phases {
             let [a, b] = [0, 1].map(|side| at.profiles[side].value[bin] - means[side]);
-            product += a * b;
-            squares = [squares[0] + a * a, squares[1] + b * b];
+            sum = (sum.0 + (a - b) * (a - b), sum.1 + a * a + b * b);
         }
     }
-    // Runs differ in contrast: profiles are compared at equal squares.
-    let both = squares[0] + squares[1];
-    let alike = product / (squares[0] * squares[1]).sqrt().max(f64::MIN_POSITIVE);
-    ((1.0 - alike) * both, both)
+    sum
 }
 
 fn share(parts: impl Iterator<Item = SquareSums>) -> f64 {

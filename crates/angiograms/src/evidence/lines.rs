@@ -46,11 +46,21 @@ pub fn blurred(image: &Image, pixels: f64) -> Image {
     separable(image, &gaussian(pixels as f32))
 }
 
-/// Thin structures of a frame in line integrals: the image less its opening. `mm` is the size of a pixel at the isocentre.
-pub fn thin_structures(image: &Image, mm: f64) -> Image {
+/// Thin structures of a frame.
+#[derive(Debug, Clone)]
+pub struct Thin {
+    /// The blurred image less its opening, line integrals: it shows where thin structures are.
+    pub smooth: Image,
+    /// The image less the same opening: it shows how much there is.
+    pub sharp: Image,
+}
+
+/// Finds the thin structures of a frame. `mm` is the size of a pixel at the isocentre.
+pub fn thin_structures(image: &Image, mm: f64) -> Thin {
     let blurred = blurred(image, BLUR_MM / mm);
     let wide = opening(&blurred, (THIN_MM / mm).round().max(1.0) as usize);
-    map2(&blurred, &wide, |value, wide| value - wide)
+    let [smooth, sharp] = [&blurred, image].map(|image| map2(image, &wide, |value, wide| value - wide));
+    Thin { smooth, sharp }
 }
 
 /// Strength of lines in a frame, about 0.6 of the line integral of a bar at its own scale; 0 where there is no line.
@@ -85,7 +95,7 @@ fn derivatives(sigma: f32) -> [Vec<f32>; 3] {
 /// A frame after the displacement of its background was removed.
 #[derive(Debug, Clone)]
 pub struct SteadyFrame {
-    /// Its thin structures ([`thin_structures`]).
+    /// Its thin structures, without blur ([`Thin::sharp`]).
     pub thin: Image,
     /// Its lines ([`line_strength`]).
     pub lines: Image,
@@ -99,9 +109,9 @@ pub fn vessels(frames: &[SteadyFrame], shown: &[bool], mm: f64) -> Vec<Image> {
     let with_empty = empty.len() >= MIN_EMPTY;
     let share = if with_empty { 0.5 } else { REST_PERCENTILE };
     let resting: Vec<&SteadyFrame> = if with_empty { empty } else { frames.iter().collect() };
-    let at_rest =
-        |of: fn(&SteadyFrame) -> &Image| dilate(&over_frames(resting.iter().map(|frame| of(frame)), share), 1);
-    let (thin, lines) = (at_rest(|frame| &frame.thin), at_rest(|frame| &frame.lines));
+    let at_rest = |of: fn(&SteadyFrame) -> &Image| over_frames(resting.iter().map(|frame| of(frame)), share);
+    // A displacement that is a pixel wrong must not leave lines; of the integrals, a maximum of noise would be taken away.
+    let (thin, lines) = (at_rest(|frame| &frame.thin), dilate(&at_rest(|frame| &frame.lines), 1));
     let seen = |image: &Image| -> Vec<f32> {
         image.values.iter().zip(shown).filter(|(_, shown)| **shown).map(|(value, _)| *value).collect()
     };

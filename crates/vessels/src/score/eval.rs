@@ -17,7 +17,8 @@ use std::borrow::Cow;
 /// Description of the Dice threshold for X-Gaussian, whose opacities are no attenuation.
 const OPACITY_RULE: &str = "the published threshold of 0.05 on the sum of opacities";
 /// Description of the Dice threshold where no attenuation is stated.
-const VESSEL_RULE: &str = "Otsu's threshold of the predicted maximum projections, clipped at their 99.5th percentile";
+const VESSEL_RULE: &str =
+    "a fifth of the strongest predicted attenuation, the 99.5th percentile of the maximum projections";
 /// Share of an image's pixels whose change may exceed the one that counts as its strongest.
 const STRONGEST: f64 = 0.005;
 /// A dynamic field whose line integrals stay below this share of the strongest change in the data has vanished.
@@ -164,7 +165,7 @@ fn choose_thresholds(
         (None, None) => {
             let all = |maxima: Maxima| {
                 let values: Vec<f32> = seen.iter().flat_map(|r| maxima(r).iter().copied()).collect();
-                f64::from(threshold::vessel_threshold(&values))
+                f64::from(threshold::threshold_of_unstated(&values))
             };
             (all(DYNAMIC), all(TOTAL), VESSEL_RULE)
         }

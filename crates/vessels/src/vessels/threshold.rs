@@ -55,8 +55,14 @@ pub fn vessel_threshold(values: &[f32]) -> f32 {
     otsu(&values.iter().map(|v| v.min(hottest)).collect::<Vec<_>>())
 }
 
+/// Threshold for vessels whose attenuation is not stated, from values of a field that are mostly zero: [`VESSEL_SHARE`] of the strongest one,
+/// hot spots left out, which stands for the attenuation of the vessels. Zero where fewer than half a percent of the values exceed zero.
+pub fn threshold_of_unstated(values: &[f32]) -> f32 {
+    VESSEL_SHARE as f32 * percentile(values, HOT)
+}
+
 /// Attenuation per mm above which the dynamic field of a model counts as vessel: [`VESSEL_SHARE`] of the stated one, or
-/// Otsu's threshold of the field's values at phase 0 on a grid; for X-Gaussian's opacities the published threshold.
+/// [`threshold_of_unstated`] of the field's values at phase 0 on a grid; for X-Gaussian's opacities the published threshold.
 ///
 /// # Errors
 /// Errors of [`Renderer::sample_patient`].
@@ -69,7 +75,7 @@ pub fn vessel_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &Patien
     }
     let values = renderer.sample_patient(Component::Dynamic, 0, grid)?;
     let inside: Vec<f32> = values.into_iter().filter(|v| *v > 0.0).collect();
-    Ok(f64::from(vessel_threshold(&inside)))
+    Ok(f64::from(threshold_of_unstated(&inside)))
 }
 
 #[cfg(test)]
@@ -102,5 +108,17 @@ mod tests {
         let hot = vessel_threshold(&values);
         assert!((cool - hot).abs() < 0.02 && (0.13..0.6).contains(&hot), "{cool} without, {hot} with hot spots");
         assert!(otsu(&values) > 1.4, "Otsu alone sees the hot spots only: {}", otsu(&values));
+    }
+
+    #[test]
+    fn vessels_of_unknown_attenuation_are_found_to_a_fifth_of_the_strongest() {
+        // Two percent of thick vessels, as much of thin ones, and hot spots.
+        let mut values = two_levels(0.3, 200, 1.0, 200);
+        values.extend([0.0; 9600]);
+        values.extend([40.0; 4]);
+        let threshold = threshold_of_unstated(&values);
+        assert!((0.15..0.25).contains(&threshold), "{threshold}");
+        assert!(vessel_threshold(&values) > 0.4, "Otsu's threshold cuts the thin ones off");
+        assert_eq!(threshold_of_unstated(&[0.0; 10]), 0.0);
     }
 }
