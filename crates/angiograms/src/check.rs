@@ -34,6 +34,8 @@ const AS_GOOD: f64 = 1.25;
 /// Minimum share of a view's vessel pixels that the other views explain where all are said to show the same object: exact views without
 /// noise explain .97 to .99.
 const SAME_OBJECT: f64 = 0.9;
+/// Maximum number of views for which that share is expected: all others must explain a pixel, and 18 exact ones explain .85.
+const FEW_VIEWS: usize = 4;
 /// Minimum number of views among which two exchanged ones are told: two views alone explain each other about as well when they are exchanged.
 const MIN_VIEWS_OF_EXCHANGE: usize = 3;
 /// Share of a view's changes next to its edges above which vessels are likely to be cut off.
@@ -113,7 +115,7 @@ impl Check {
             (Verdict::Mistake, Some(mistake)) => {
                 format!("the views agree once one mistake is corrected: {mistake}")
             }
-            (Verdict::Agree, _) if self.explained[0] < SAME_OBJECT => format!(
+            (Verdict::Agree, _) if self.explained[0] < SAME_OBJECT && self.views.len() <= FEW_VIEWS => format!(
                 "the views agree on what moves, but all other views show a vessel for only {:.0} % of a view's vessel pixels ({:.0} % of \
                  them are expected): geometry or phases may be off, or there may be little to see",
                 100.0 * self.explained[0],
