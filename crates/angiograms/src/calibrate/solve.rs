@@ -314,6 +314,21 @@ mod tests {
     }
 
     #[test]
+    fn poses_fitted_to_half_of_the_planes_explain_the_other_half() {
+        let views = views(&ANGLES);
+        let [even, odd] = [Planes::Even, Planes::Odd].map(|planes| Part { planes, ..views.whole() });
+        let mut poses = off(3);
+        let power = |part: &Part| misfit(&views, &poses, 4.0, part).power;
+        let (halves, whole) = ([power(&even), power(&odd)], power(&views.whole()));
+        assert!((halves[0] + halves[1] - whole).abs() < 1e-6 * whole, "{halves:?} of {whole}");
+        assert!(halves.iter().all(|half| *half > 0.1 * whole), "{halves:?} of {whole}");
+        let before = misfit(&views, &poses, 4.0, &odd).share();
+        refine(&views, &mut poses, &Stage { steps: 4, ..stage() }, &even);
+        let after = misfit(&views, &poses, 4.0, &odd).share();
+        assert!(after < 0.5 * before, "{before} before, {after} after");
+    }
+
+    #[test]
     fn slopes_are_those_of_the_residuals() {
         let views = views(&ANGLES);
         let unknowns = unknowns(&views, &stage(), &[0, 1, 2]);
