@@ -7,6 +7,7 @@ use nertca_vk::calibrate::calibrate;
 use nertca_vk::calibrate::choose::{Correction, Tags, fit};
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::calibrate::observed::Observed;
+use nertca_vk::calibrate::profiles::Planes;
 use nertca_vk::config::Config;
 use nertca_vk::geometry::{MM_PER_UNIT, ViewRays, lps_mm_from_world};
 use nertca_vk::scan::dataset::{Dataset, Layout};
@@ -57,7 +58,7 @@ fn views_are_brought_together() {
         }
         let all: Vec<usize> = (0..PHASES as usize).collect();
         let observed = Observed::new(&shot.dataset);
-        let poses = fit(&observed, Correction::Breathing, Tags::Usual, &observed.fine.whole());
+        let poses = fit(&observed, Correction::Breathing, Tags::Usual, Planes::All);
         for t in all {
             let mean = poses.gains.iter().map(|g| g[t]).sum::<f64>() / f64::from(n_views);
             assert!(mean.abs() < 1e-3, "mean contrast of phase {t}: {mean}");

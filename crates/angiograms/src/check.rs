@@ -14,7 +14,7 @@ mod polarity;
 use crate::calibrate::choose::{Correction, Tags, fit};
 use crate::calibrate::observed::Observed;
 use crate::calibrate::pose::Poses;
-use crate::calibrate::profiles::Views;
+use crate::calibrate::profiles::{Planes, Views};
 use crate::calibrate::silhouettes;
 use crate::error::{Error, Result};
 use crate::evidence::noise::NOISY;
@@ -36,7 +36,7 @@ const AS_GOOD: f64 = 1.25;
 const SAME_OBJECT: f64 = 0.9;
 /// Maximum number of views for which that share is expected: all others must explain a pixel, and 18 exact ones explain .85.
 const FEW_VIEWS: usize = 4;
-/// Minimum number of views among which two exchanged ones are told: two views alone explain each other about as well when they are exchanged.
+/// Minimum number of views among which two exchanged ones are looked for: two views alone agree about as well when they are exchanged.
 const MIN_VIEWS_OF_EXCHANGE: usize = 3;
 /// Share of a view's changes next to its edges above which vessels are likely to be cut off.
 const CUT_OFF: f64 = 0.05;
@@ -182,7 +182,7 @@ fn checked(dataset: &Dataset, observed: &Observed, thoroughly: bool) -> Check {
         Some(stated) if thoroughly || inverted => {
             named(stated, &explanations(dataset, observed, &judged, inverted), inverted, || {
                 // Other positions of the views explain small differences as well as a mistake does.
-                let poses = fit(observed, Correction::Static, Tags::Wrong, &observed.fine.whole());
+                let poses = fit(observed, Correction::Static, Tags::Wrong, Planes::All);
                 Comparison::at(&judged.only(observed.fine.clone()), &poses, Sharpness::Fine).residual()
             })
         }
@@ -294,9 +294,9 @@ fn explanations(dataset: &Dataset, observed: &Observed, judged: &Judged, inverte
     let judged = judged.only(observed.fine.clone());
     let stated = Comparison::of(&judged, Sharpness::Fine);
     let suspects = stated.suspects(&judged, AGREES);
-    let is_told = observed.views.len() >= MIN_VIEWS_OF_EXCHANGE;
+    let is_determined = observed.views.len() >= MIN_VIEWS_OF_EXCHANGE;
     let pairs = suspects.iter().enumerate().flat_map(|(k, b)| suspects[..k].iter().map(|a| [*a, *b]));
-    all.extend(pairs.filter(|_| is_told).filter_map(|pair| {
+    all.extend(pairs.filter(|_| is_determined).filter_map(|pair| {
         let views = exchanged(dataset, observed, &judged, pair)?;
         let [a, b] = pair.map(|slot| observed.views[slot]);
         let fine = stated.after_change(&views, &pair).residual();

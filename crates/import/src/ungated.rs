@@ -227,7 +227,7 @@ fn in_one_plane(directions: &[DVec3]) -> Option<String> {
     (directions.len() > 2 && out_deg < ONE_PLANE_DEG).then(|| {
         format!(
             "all views look along directions within {out_deg:.1} degrees of one plane: no pair of them shows a displacement of the patient \
-             within this plane between the runs. A run from outside of the plane, such as a steep cranial or caudal one, decides it"
+             within this plane between the runs. A run from outside of the plane, such as a steep cranial or caudal one, shows it"
         )
     })
 }

@@ -291,15 +291,15 @@ mod tests {
 
     #[test]
     fn wrong_tags_are_found_where_they_may_be_far_off() {
-        // Images that speak as loudly as the prior ask for positions of ten deviations; angles are measured alike.
-        let asked = 10.0;
+        // Images measure all values as ten deviations, with the error that the prior expects.
+        let measured = 10.0;
         let found = |wrong_tags: bool| {
             let unknowns = unknowns(Freedom { wrong_tags, ..Freedom::ALL });
             let mut poses = Poses::stated(2, 3);
             for _ in 0..50 {
                 let mut normal = Normal::zeros(unknowns.all.len());
                 for (i, unknown) in unknowns.all.iter().enumerate() {
-                    let off = unknown.value(&unknowns.axes, &poses) / unknown.deviation() - asked;
+                    let off = unknown.value(&unknowns.axes, &poses) / unknown.deviation() - measured;
                     normal.add(&[i], |_, _| 1.0, |_| off);
                 }
                 poses = normal.stepped(1.0, &unknowns, &poses).unwrap();

@@ -121,7 +121,7 @@ pub struct Pair {
     pub views: [usize; 2],
 }
 
-/// Width of the stripes of planes that are kept for a test, bins: several times the detail that the fine stages compare.
+/// Width of the stripes of planes that are kept for a test, bins of half a pixel: several times the detail that the fine stages compare.
 const STRIPE: i64 = 32;
 
 /// Planes of each pencil that take part.
@@ -145,15 +145,6 @@ impl Planes {
             Planes::Odd => !is_even,
         }
     }
-}
-
-/// Part of the data that is fitted or tested.
-#[derive(Debug, Clone)]
-pub struct Part {
-    /// Cardiac phases.
-    pub phases: Vec<usize>,
-    /// Planes of each pair of views.
-    pub planes: Planes,
 }
 
 /// All views that are made consistent.
@@ -225,11 +216,6 @@ impl Views {
         let all = (0..views.len()).flat_map(|b| (0..b).map(move |a| Pair { views: [a, b] }));
         let pairs = all.filter(|p| tells(&views[p.views[0]].stand, &views[p.views[1]].stand)).collect();
         Views { views, pairs, n_phases, bin: pixel / BINS_PER_PIXEL }
-    }
-
-    /// Returns all phases and all planes.
-    pub fn whole(&self) -> Part {
-        Part { phases: (0..self.n_phases).collect(), planes: Planes::All }
     }
 
     /// Phases that both views of a pair have, among those wanted.

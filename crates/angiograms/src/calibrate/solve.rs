@@ -2,7 +2,7 @@
 
 use crate::calibrate::estimate::{Freedom, Normal, Unknown, Unknowns};
 use crate::calibrate::pose::Poses;
-use crate::calibrate::profiles::{Blur, Moving, Pair, PairAtPhase, Part, Pencil, Planes, Views};
+use crate::calibrate::profiles::{Blur, Moving, Pair, PairAtPhase, Pencil, Planes, Views};
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -34,6 +34,10 @@ impl Stage {
     fn kernel(&self) -> Blur {
         if self.band { Blur::band(self.blur, WIDE * self.blur) } else { Blur::gaussian(self.blur) }
     }
+}
+
+fn all_phases(views: &Views) -> Vec<usize> {
+    (0..views.n_phases).collect()
 }
 
 /// Collects the unknowns of a stage at some phases.
@@ -165,10 +169,10 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 }
 
 impl PairTerms {
-    fn of(views: &Views, pair: Pair, poses: &Poses, stage: &Stage, part: &Part, unknowns: &Unknowns) -> PairTerms {
+    fn of(views: &Views, pair: Pair, poses: &Poses, stage: &Stage, planes: Planes, unknowns: &Unknowns) -> PairTerms {
         let blur = stage.kernel();
-        let profiles = views.profiles(pair, poses, &part.phases, &blur);
-        let residual = |at: &PairAtPhase| Residuals::of(at, pair, views, poses, unknowns, part.planes);
+        let profiles = views.profiles(pair, poses, &all_phases(views), &blur);
+        let residual = |at: &PairAtPhase| Residuals::of(at, pair, views, poses, unknowns, planes);
         let residuals: Vec<Residuals> = profiles.iter().map(residual).collect();
         let mut terms = PairTerms::none(unknowns);
         for r in &residuals {
@@ -207,8 +211,8 @@ impl PairTerms {
     }
 
     /// Returns the sum over all pairs.
-    fn sum(views: &Views, poses: &Poses, stage: &Stage, part: &Part, unknowns: &Unknowns) -> PairTerms {
-        let term = |pair: &Pair| PairTerms::of(views, *pair, poses, stage, part, unknowns);
+    fn sum(views: &Views, poses: &Poses, stage: &Stage, planes: Planes, unknowns: &Unknowns) -> PairTerms {
+        let term = |pair: &Pair| PairTerms::of(views, *pair, poses, stage, planes, unknowns);
         let terms: Vec<PairTerms> = views.pairs.par_iter().map(term).collect();
         terms.iter().fold(PairTerms::none(unknowns), |mut sum, PairTerms { normal, misfit }| {
             sum.normal.add_all(normal);
@@ -246,11 +250,11 @@ impl Misfit {
     }
 }
 
-/// Runs a stage's steps on a part of the data. Poses do not change where there is no information.
-pub fn refine(views: &Views, poses: &mut Poses, stage: &Stage, part: &Part) {
-    let unknowns = unknowns(views, stage, &part.phases);
+/// Runs a stage's steps on some planes. Poses do not change where there is no information.
+pub fn refine(views: &Views, poses: &mut Poses, stage: &Stage, planes: Planes) {
+    let unknowns = unknowns(views, stage, &all_phases(views));
     for _ in 0..stage.steps {
-        let PairTerms { normal, misfit } = PairTerms::sum(views, poses, stage, part, &unknowns);
+        let PairTerms { normal, misfit } = PairTerms::sum(views, poses, stage, planes, &unknowns);
         if misfit.power == 0.0 {
             return;
         }
@@ -259,12 +263,12 @@ pub fn refine(views: &Views, poses: &mut Poses, stage: &Stage, part: &Part) {
     }
 }
 
-/// Misfit of the views in a part of the data, with the contrasts of the frames fitted.
-pub fn misfit(views: &Views, poses: &Poses, blur: f64, part: &Part) -> Misfit {
+/// Misfit of the views in some planes, with the contrasts of the frames fitted.
+pub fn misfit(views: &Views, poses: &Poses, blur: f64, planes: Planes) -> Misfit {
     let stage = Stage { blur, band: true, steps: 2, freedom: Freedom::CONTRASTS, demean: true, temper: 1.0 };
     let mut fitted = Poses { gains: Poses::stated(views.views.len(), views.n_phases).gains, ..poses.clone() };
-    refine(views, &mut fitted, &stage, part);
-    PairTerms::sum(views, &fitted, &stage, part, &unknowns(views, &stage, &[])).misfit
+    refine(views, &mut fitted, &stage, planes);
+    PairTerms::sum(views, &fitted, &stage, planes, &unknowns(views, &stage, &[])).misfit
 }
 
 #[cfg(test)]
@@ -307,24 +311,24 @@ mod tests {
     fn a_pair_has_one_profile() {
         let views = views(&ANGLES);
         assert_eq!(views.pairs.len(), 3);
-        let at_truth = misfit(&views, &Poses::stated(3, PHASES), 4.0, &views.whole()).share();
+        let at_truth = misfit(&views, &Poses::stated(3, PHASES), 4.0, Planes::All).share();
         assert!(at_truth < 0.002, "{at_truth}");
-        let apart = misfit(&views, &off(3), 4.0, &views.whole()).share();
+        let apart = misfit(&views, &off(3), 4.0, Planes::All).share();
         assert!(apart > 0.02, "{apart}");
     }
 
     #[test]
     fn poses_fitted_to_half_of_the_planes_explain_the_other_half() {
         let views = views(&ANGLES);
-        let [even, odd] = [Planes::Even, Planes::Odd].map(|planes| Part { planes, ..views.whole() });
+        let [even, odd] = [Planes::Even, Planes::Odd];
         let mut poses = off(3);
-        let power = |part: &Part| misfit(&views, &poses, 4.0, part).power;
-        let (halves, whole) = ([power(&even), power(&odd)], power(&views.whole()));
+        let power = |planes: Planes| misfit(&views, &poses, 4.0, planes).power;
+        let (halves, whole) = ([power(even), power(odd)], power(Planes::All));
         assert!((halves[0] + halves[1] - whole).abs() < 1e-6 * whole, "{halves:?} of {whole}");
         assert!(halves.iter().all(|half| *half > 0.1 * whole), "{halves:?} of {whole}");
-        let before = misfit(&views, &poses, 4.0, &odd).share();
-        refine(&views, &mut poses, &Stage { steps: 4, ..stage() }, &even);
-        let after = misfit(&views, &poses, 4.0, &odd).share();
+        let before = misfit(&views, &poses, 4.0, odd).share();
+        refine(&views, &mut poses, &Stage { steps: 4, ..stage() }, even);
+        let after = misfit(&views, &poses, 4.0, odd).share();
         assert!(after < 0.5 * before, "{before} before, {after} after");
     }
 
