@@ -6,6 +6,7 @@ mod rhythm;
 
 use crate::evidence::lines::{self as evidence, SteadyFrame, Thin, line_strength, over_frames, thin_structures};
 use crate::raster::{Image, dilate, median, percentile};
+use crate::scan::hidden::{at_border, flood};
 use displacement::{displacements, moved, robust_deviation, shown_by_all};
 use rayon::prelude::*;
 pub use rhythm::Rhythm;
@@ -125,23 +126,11 @@ fn near(displacements: &[[f32; 2]], mm: f64) -> Vec<usize> {
 fn shown(frames: &[Image], dark: f32) -> Vec<bool> {
     let usual = over_frames(frames.iter(), 0.5);
     let (width, height) = (usual.width, usual.height);
-    let is_end = |at: usize, n: usize| at == 0 || at + 1 == n;
-    let is_border = |p: usize| is_end(p % width, width) || is_end(p / width, height);
-    let mut blade = vec![false; width * height];
-    let mut next: Vec<usize> = (0..blade.len()).filter(|p| is_border(*p) && usual.values[*p] > dark).collect();
-    next.iter().for_each(|p| blade[*p] = true);
-    while let Some(p) = next.pop() {
-        let beside = [(p % width > 0, p.wrapping_sub(1)), (p % width + 1 < width, p + 1)];
-        let across = [(p >= width, p.wrapping_sub(width)), (p + width < blade.len(), p + width)];
-        for (_, q) in beside.into_iter().chain(across).filter(|(exists, _)| *exists) {
-            if !blade[q] && usual.values[q] > dark {
-                blade[q] = true;
-                next.push(q);
-            }
-        }
-    }
+    let is_dark = |p: usize| usual.values[p] > dark;
+    let border = (0..width * height).filter(|p| at_border(*p, width, height) && is_dark(*p));
+    let blade = flood(border, width, height, is_dark);
     let rim = ((RIM * width.min(height) as f64) as usize).max(4);
-    let wide = Image { width, height, values: blade.iter().map(|b| f32::from(u8::from(*b))).collect() };
+    let wide = Image { width, height, values: blade.iter().map(|b| f32::from(u8::from(b.is_some()))).collect() };
     let blade = dilate(&wide, rim);
     let within = |at: usize, n: usize| (rim..n.saturating_sub(rim)).contains(&at);
     (0..width * height)

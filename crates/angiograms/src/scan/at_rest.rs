@@ -4,11 +4,13 @@
 use crate::geometry::MM_PER_UNIT;
 use crate::raster::{Image, dilate, opening, percentile};
 use crate::scan::dataset::{Frame, Split, View};
+use crate::scan::hidden::flood;
 
 /// Width of the widest vessel that is searched where contrast comes and goes, mm at the isocentre: coronary arteries are up to 5 mm wide.
 const WIDEST_VESSEL_MM: f64 = 6.0;
 /// Widths of the widest vessel that are tried for an object at rest, mm: aneurysms, grafts and phantoms are wider than healthy arteries.
 const WIDTHS_MM: [f64; 4] = [WIDEST_VESSEL_MM, 9.0, 13.5, 20.0];
+// The four numbers below are judgements that drawn tubes test, with and without ribs behind them; no data were measured with others.
 /// Percentile of what stands out that counts as the strength of the vessels.
 const STRENGTH_PERCENTILE: f64 = 0.9;
 /// Share of that strength from which a pixel shows a vessel.
@@ -75,21 +77,10 @@ fn continues(columns: usize, narrow: &[f32], wider: &[f32]) -> bool {
     let strength = percentile(&standing, STRENGTH_PERCENTILE);
     let is_vessel = |p: usize| narrow[p] > SHOWN * strength;
     let is_added = |p: usize| !is_vessel(p) && wider[p] > strength;
-    let mut reached: Vec<bool> = (0..narrow.len()).map(is_vessel).collect();
-    let mut front: Vec<usize> = (0..narrow.len()).filter(|p| reached[*p]).collect();
-    let (vessels, mut added) = (front.len(), 0);
-    while let Some(p) = front.pop() {
-        let (x, y) = (p % columns, p / columns);
-        let beside = [(x > 0).then(|| p - 1), (x + 1 < columns).then_some(p + 1), (y > 0).then(|| p - columns)];
-        let below = (p + columns < narrow.len()).then_some(p + columns);
-        for next in beside.into_iter().chain([below]).flatten().filter(|next| is_added(*next)) {
-            if !std::mem::replace(&mut reached[next], true) {
-                added += 1;
-                front.push(next);
-            }
-        }
-    }
-    added as f64 >= WIDER * vessels as f64
+    let vessels: Vec<usize> = (0..narrow.len()).filter(|p| is_vessel(*p)).collect();
+    let reached = flood(vessels.iter().copied(), columns, narrow.len() / columns, is_added);
+    let added = reached.iter().flatten().count() - vessels.len();
+    added as f64 >= WIDER * vessels.len() as f64
 }
 
 /// Returns the value from which structures stand out of noise: deviations from the median that noise has.

@@ -88,7 +88,7 @@ fn nearest_shown(hidden: &[bool], width: usize) -> Vec<usize> {
 }
 
 /// For each pixel, the start from which it is reached first, by steps along rows and columns to pixels that `enters` allows.
-fn flood(
+pub(crate) fn flood(
     starts: impl Iterator<Item = usize>,
     width: usize,
     height: usize,
@@ -107,7 +107,7 @@ fn flood(
     from
 }
 
-fn at_border(pixel: usize, width: usize, height: usize) -> bool {
+pub(crate) fn at_border(pixel: usize, width: usize, height: usize) -> bool {
     let (x, y) = (pixel % width, pixel / width);
     x == 0 || y == 0 || x + 1 == width || y + 1 == height
 }
