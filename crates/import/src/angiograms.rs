@@ -4,7 +4,7 @@ use crate::dicom::{PixelRange, Relationship, Run};
 use crate::error::{Error, Result};
 use crate::geometry::CArm;
 use crate::raster::Image;
-use crate::scan::at_rest::{vessel_pixels, vessel_pixels_of, widest_vessel_mm, without_vessels};
+use crate::scan::at_rest::{WIDEST_VESSEL_MM, vessel_pixels, without_vessels};
 use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
 use crate::scan::references::ReferencedRun;
 use crate::stands::stands;
@@ -179,8 +179,7 @@ impl Prepared {
         let stands = stands(&c_arms, [width, height]);
         let vessel = vessel_pixels(at_isocentre);
         let selected = select(run, &frames, vessel, options, &mut notes)?;
-        let chosen =
-            Chosen { run, frames: &frames, stands: &stands, selected: &selected, vessel, pixel_mm: at_isocentre };
+        let chosen = Chosen { run, frames: &frames, stands: &stands, selected: &selected, vessel };
         let views = chosen.stands_of(&selected).len();
         if views > 1 {
             notes.push(format!(
@@ -238,8 +237,6 @@ struct Chosen<'a> {
     selected: &'a [usize],
     /// Radius of the widest vessel that is searched, pixels.
     vessel: usize,
-    /// Size of a pixel at the isocentre, mm.
-    pixel_mm: f64,
 }
 
 impl Chosen<'_> {
@@ -257,13 +254,16 @@ impl Chosen<'_> {
         let beat_of;
         let taken: Vec<Option<BeatTime>> = match &options.gating {
             Gating::Still => {
-                let mut widest_mm = 0.0f64;
-                let mut of_stand = |stand: usize| {
+                notes.push(format!(
+                    "{}: {} frames were averaged; phase 1 is the image without structures up to {WIDEST_VESSEL_MM} mm \
+                     wide",
+                    run.name(),
+                    selected.len()
+                ));
+                let of_stand = |stand: usize| {
                     let frames = from(stand, selected);
                     let mean = mean(self.frames, &frames);
-                    let width_mm = widest_vessel_mm(&mean, self.pixel_mm, DARK);
-                    widest_mm = widest_mm.max(width_mm);
-                    let background = without_vessels(&mean, vessel_pixels_of(width_mm, self.pixel_mm), DARK);
+                    let background = without_vessels(&mean, self.vessel, DARK);
                     let image = |phase: u32, image: Image| PhaseImage {
                         taken: BeatTime::at_phase(phase),
                         stand,
@@ -272,13 +272,7 @@ impl Chosen<'_> {
                     };
                     [image(0, mean), image(1, background)]
                 };
-                let images = self.stands_of(selected).into_iter().flat_map(&mut of_stand).collect();
-                notes.push(format!(
-                    "{}: {} frames were averaged; phase 1 is the image without structures up to {widest_mm} mm wide",
-                    run.name(),
-                    selected.len()
-                ));
-                return Ok(images);
+                return Ok(self.stands_of(selected).into_iter().flat_map(of_stand).collect());
             }
             Gating::Phases(list) if list.len() == selected.len() => {
                 if let Some(bad) = list.iter().find(|p| !(0.0..f64::from(n_phases)).contains(*p)) {
