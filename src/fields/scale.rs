@@ -248,6 +248,7 @@ mod tests {
             hidden: Default::default(),
             vessel_attenuation: None,
             still: false,
+            vessels_alone: false,
             views_adjusted: false,
             prior: None,
         }

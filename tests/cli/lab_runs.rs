@@ -98,6 +98,8 @@ fn runs_of_a_lab_become_a_tree() {
     // The images are frames of one beat that is filled, and all runs show the same part of the beat at the same phase.
     let truth = read(&runs.join("truth.json"));
     let manifest = read(&data.join("dataset.json"));
+    assert_eq!(manifest["vessels_alone"], true);
+    nertca(&["check", text(&data)]);
     let references = read(&data.join("references.json"));
     let mut errors: Vec<(u64, f64)> = Vec::new();
     for image in references["images"].as_array().unwrap() {

@@ -151,6 +151,7 @@ impl Studio {
             hidden: Default::default(),
             vessel_attenuation: Some(Tissues::XCAT.vessel * 100.0),
             still: false,
+            vessels_alone: false,
             views_adjusted: false,
             prior: None,
             notes: Vec::new(),

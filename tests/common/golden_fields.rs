@@ -64,6 +64,7 @@ impl Golden {
             height,
             n_phases: phases,
             still: false,
+            vessels_alone: false,
             views_adjusted: false,
             prior: None,
             depth_range: (-self.number("depth"), self.number("depth")),

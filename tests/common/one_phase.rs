@@ -42,6 +42,7 @@ pub fn dataset(angles: &[[f64; 2]], [width, height]: [usize; 2], image: impl Fn(
         hidden: Default::default(),
         vessel_attenuation: None,
         still: false,
+        vessels_alone: false,
         views_adjusted: false,
         prior: None,
     }

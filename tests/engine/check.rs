@@ -95,6 +95,7 @@ fn angiograms_of(angles: &[(f64, f64)], flaws: Flaws, vessels: &[Vec<(DVec3, f64
         hidden: Default::default(),
         vessel_attenuation: None,
         still: false,
+        vessels_alone: false,
         views_adjusted: false,
         prior: None,
         notes: Vec::new(),

@@ -16,7 +16,7 @@ pub mod pose;
 pub mod profiles;
 pub mod runs;
 #[cfg(test)]
-mod samples;
+pub(crate) mod samples;
 pub mod settings;
 mod sight;
 pub mod silhouettes;

@@ -186,6 +186,7 @@ impl Intake {
             depth_half_extent_mm: self.options.depth_half_extent_mm,
             vessel_attenuation_per_mm: None,
             still: self.is_still(),
+            vessels_alone: self.runs.iter().take(runs).all(|run| run.beat.is_some()),
             size: [first.image.width, first.image.height],
             c_arm: first.c_arm.clone(),
         };

@@ -280,6 +280,7 @@ fn shoot(
         depth_half_extent_mm: stage.depth_half_extent_mm,
         vessel_attenuation_per_mm: stage.vessel_attenuation,
         still: stage.still,
+        vessels_alone: false,
         size: [size, size],
         c_arm: stage.c_arms[0].clone(),
     };

@@ -240,10 +240,11 @@ impl Observed {
             Moving::new(s.stand.clone(), size, &s.mask, &above.collect::<Vec<_>>())
         };
         let signed = |s: &ObservedView| Moving::new(s.stand.clone(), size, &s.wide_mask, &s.above);
+        let views = |all: Vec<Moving>| Views { vessels_alone: dataset.vessels_alone, ..Views::new(all, n_phases) };
         Observed {
             views: series.iter().map(|s| s.view).collect(),
-            coarse: Views::new(seen.iter().map(positive).collect(), n_phases),
-            fine: Views::new(seen.iter().map(signed).collect(), n_phases),
+            coarse: views(seen.iter().map(positive).collect()),
+            fine: views(seen.iter().map(signed).collect()),
             change: seen.iter().map(|s| s.change).fold(0.0, f64::max),
             changes: seen.iter().map(|s| s.change).collect(),
             noise: seen.iter().map(|s| s.noise_share).collect(),

@@ -156,6 +156,8 @@ pub struct Views {
     pub pairs: Vec<Pair>,
     /// Cardiac phases.
     pub n_phases: usize,
+    /// Whether the images show vessels and nothing else, so that profiles at rest are no error of a background.
+    pub vessels_alone: bool,
     /// Width of a bin, radians.
     pub bin: f64,
 }
@@ -215,7 +217,7 @@ impl Views {
         let pixel = views.iter().map(side).sum::<f64>() / views.len().max(1) as f64;
         let all = (0..views.len()).flat_map(|b| (0..b).map(move |a| Pair { views: [a, b] }));
         let pairs = all.filter(|p| tells(&views[p.views[0]].stand, &views[p.views[1]].stand)).collect();
-        Views { views, pairs, n_phases, bin: pixel / BINS_PER_PIXEL }
+        Views { views, pairs, n_phases, vessels_alone: false, bin: pixel / BINS_PER_PIXEL }
     }
 
     /// Phases that both views of a pair have, among those wanted.

@@ -5,13 +5,13 @@ use crate::calibrate::profiles::{Moving, Views};
 use crate::geometry::{CArm, Geometry};
 use glam::DVec3;
 
-pub(super) const SIZE: [usize; 2] = [40, 36];
-pub(super) const PHASES: usize = 3;
-pub(super) const ANGLES: [(f64, f64); 3] = [(-30.0, 20.0), (45.0, -15.0), (80.0, 25.0)];
+pub(crate) const SIZE: [usize; 2] = [40, 36];
+pub(crate) const PHASES: usize = 3;
+pub(crate) const ANGLES: [(f64, f64); 3] = [(-30.0, 20.0), (45.0, -15.0), (80.0, 25.0)];
 
 /// Exact line integrals of blobs that move over three phases, seen from nearby by views at the given angles and with
 /// tables off centre; the last view has other pixels.
-pub(super) fn views(angles: &[(f64, f64)]) -> Views {
+pub(crate) fn views(angles: &[(f64, f64)]) -> Views {
     let blob = |k: usize, t: usize| {
         let (a, b) = (1.3 * k as f64 + 0.4 * t as f64, 2.1 * k as f64 - 0.3 * t as f64);
         DVec3::new(0.05 * a.sin(), 0.05 * b.cos(), 0.05 * (a + b).sin())

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 /// Residual that is always expected, as a share of the root mean square of the profiles.
 const FLOOR: f64 = 0.02;
 /// Standard deviation of the Gaussian that a band subtracts, in standard deviations of the blur.
-const WIDE: f64 = 4.0;
+pub(crate) const WIDE: f64 = 4.0;
 
 /// Parameters that a stage corrects, and its settings.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -180,7 +180,7 @@ impl PairTerms {
             terms.misfit.power += r.power;
             terms.misfit.count += r.value.iter().filter(|v| **v != 0.0).count();
         }
-        if stage.demean && !residuals.is_empty() {
+        if stage.demean && !views.vessels_alone && !residuals.is_empty() {
             // The sum of squared deviations from the mean is that of the values minus that of the mean.
             let mut mean = vec![0.0; residuals[0].value.len()];
             let mut columns: Vec<(usize, Vec<f64>)> = Vec::new();

@@ -3,6 +3,7 @@
 
 use crate::calibrate::pose::Poses;
 use crate::calibrate::profiles::{Blur, Pair, PairAtPhase, Views};
+use crate::calibrate::solve::WIDE;
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -16,11 +17,14 @@ pub enum Sharpness {
 }
 
 impl Sharpness {
-    fn blur(self) -> Blur {
-        Blur::gaussian(match self {
+    /// Blur of profiles. Those of vessels alone are positive everywhere, so that unrelated ones are alike when they are blurred: there, the
+    /// wide part is removed.
+    fn blur(self, vessels_alone: bool) -> Blur {
+        let sigma = match self {
             Sharpness::Fine => 6.0,
             Sharpness::Coarse => 24.0,
-        })
+        };
+        if vessels_alone { Blur::band(sigma, WIDE * sigma) } else { Blur::gaussian(sigma) }
     }
 }
 
@@ -52,10 +56,13 @@ pub struct Agreement {
 /// Squared difference and squares of profiles.
 type SquareSums = (f64, f64);
 
-/// Parts of a pair over all phases. The mean over the phases is subtracted: it is an error of the static background.
-fn parts(phases: &[PairAtPhase]) -> SquareSums {
+/// Parts of a pair over all phases. The mean over the phases is subtracted where it may be an error of the static background.
+fn parts(phases: &[PairAtPhase], vessels_alone: bool) -> SquareSums {
     let Some(first) = phases.first() else { return (0.0, 0.0) };
     let mean = |side: usize, bin: usize| {
+        if vessels_alone {
+            return 0.0;
+        }
         phases.iter().map(|at| at.profiles[side].value[bin]).sum::<f64>() / phases.len() as f64
     };
     let mut sum = (0.0, 0.0);
@@ -126,17 +133,17 @@ impl Comparison {
 
 fn compare(views: &Views, poses: &Poses, pair: Pair, look: Sharpness) -> SquareSums {
     let phases: Vec<usize> = (0..views.n_phases).collect();
-    parts(&views.profiles(pair, poses, &phases, &look.blur()))
+    parts(&views.profiles(pair, poses, &phases, &look.blur(views.vessels_alone)), views.vessels_alone)
 }
 
 /// Share of the squares of a pair's profiles that varies over the phases both views have.
 pub(super) fn variation(views: &Views, pair: Pair) -> f64 {
     let poses = Poses::stated(views.views.len(), views.n_phases);
     let phases: Vec<usize> = (0..views.n_phases).collect();
-    let profiles = views.profiles(pair, &poses, &phases, &Sharpness::Fine.blur());
+    let profiles = views.profiles(pair, &poses, &phases, &Sharpness::Fine.blur(views.vessels_alone));
     let all = profiles.iter().flat_map(|at| &at.profiles).flat_map(|profile| &profile.value);
     let squares: f64 = all.map(|value| value * value).sum();
-    if squares > 0.0 { parts(&profiles).1 / squares } else { 0.0 }
+    if squares > 0.0 { parts(&profiles, views.vessels_alone).1 / squares } else { 0.0 }
 }
 
 /// Agreement of views over the pairs that constrain each other and are judged; `None` when there is no such pair.
@@ -154,4 +161,32 @@ pub fn agreement(views: &Views, judge: impl Fn(&Pair) -> bool) -> Option<Agreeme
         coarse: Comparison::of(views, Sharpness::Coarse).residual_of(&judged),
         pairs: views.pairs.iter().zip(&fine.by_pair).zip(&judged).map(pair).collect(),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::calibrate::samples::{ANGLES, views};
+
+    /// Views of objects that stay where they are at the first phase.
+    fn at_rest(mut views: Views, vessels_alone: bool) -> Views {
+        for view in &mut views.views {
+            let first = view.phases[0].clone();
+            view.phases.iter_mut().for_each(|phase| phase.clone_from(&first));
+        }
+        Views { vessels_alone, ..views }
+    }
+
+    #[test]
+    fn vessels_alone_are_compared_where_they_rest() {
+        let residual = |views: &Views| Comparison::of(views, Sharpness::Fine).residual();
+        let unknown = at_rest(views(&ANGLES), false);
+        assert!(variation(&unknown, unknown.pairs[0]) < 1e-6, "nothing moves, and the background is not known");
+        let same = at_rest(views(&ANGLES), true);
+        let mut other = same.clone();
+        // The second view shows the object upside down.
+        other.views[1].phases.iter_mut().flatten().for_each(|values| values.reverse());
+        let (same, other) = (residual(&same), residual(&other));
+        assert!(same < 0.01 && other > 0.1, "{same} {other}");
+    }
 }

@@ -77,9 +77,18 @@ fn lower_mode(values: &[f32], noise: f32, bias: f32) -> f32 {
     level
 }
 
+/// Raises the noise to the errors that a model has, which are a share of the strongest change.
+fn raise_to_floor(noise: &mut [f32], strongest: f32) {
+    let floor = (MIN_NOISE_SHARE * strongest).max(f32::MIN_POSITIVE);
+    noise.iter_mut().for_each(|s| *s = s.max(floor));
+}
+
 impl Background {
     /// Analyses a view.
     pub fn new(series: Series) -> Background {
+        if series.vessels_alone {
+            return Background::without(series);
+        }
         let drift = Drift::new(&series, &noise(&series));
         let stilled = drift.stilled(series);
         let images: Vec<&Image> = stilled.seen().collect();
@@ -112,10 +121,21 @@ impl Background {
             largest = largest_change(&changes, width, height);
             strongest = percentile(&largest.values, STRONGEST_PERCENTILE);
         }
-        let floor = (MIN_NOISE_SHARE * strongest).max(f32::MIN_POSITIVE);
-        noise.iter_mut().for_each(|s| *s = s.max(floor));
+        raise_to_floor(&mut noise, strongest);
         low.values.iter_mut().zip(&level.values).for_each(|(low, b)| *low = low.min(*b));
         Background { level, low, changes, noise: image(noise), strongest, drift, stilled }
+    }
+
+    /// Returns the background, 0, of images that show vessels and nothing else.
+    fn without(stilled: Series) -> Background {
+        let mut noise = noise(&stilled);
+        let changes = stilled.images.clone();
+        let [width, height] = stilled.seen().next().map_or([0, 0], |image| [image.width, image.height]);
+        let strongest = percentile(&largest_change(&changes, width, height).values, STRONGEST_PERCENTILE);
+        raise_to_floor(&mut noise, strongest);
+        let level = Image::zeros(width, height);
+        let noise = Image { values: noise, ..level };
+        Background { low: level.clone(), level, changes, noise, strongest, drift: Drift::default(), stilled }
     }
 
     /// Places the background in the corner of a canvas (columns, rows), and continues its edges there.

@@ -41,8 +41,8 @@ const BELIEVED: [f32; 2] = [0.7, 0.9];
 /// least this share must be explained as well as the second of [`BELIEVED`]; otherwise all narrow parts are rejected.
 const MIN_TOLD_WELL: f32 = 0.45;
 
-/// The wide motion of a view.
-#[derive(Debug, Clone)]
+/// The wide motion of a view; by default none.
+#[derive(Debug, Clone, Default)]
 pub struct Drift {
     /// Modes of the courses, the strongest first.
     modes: Vec<Mode>,
@@ -69,7 +69,7 @@ impl Drift {
         let deviations = deviations(&images);
         let (found, strongest) = courses(&deviations);
         if found.is_empty() {
-            return Drift { modes: Vec::new() };
+            return Drift::default();
         }
         let noise: Vec<f32> = noise.iter().map(|s| s.max(MIN_NOISE_SHARE * strongest)).collect();
         let (courses, sizes): (Vec<Vec<f32>>, Vec<f32>) = found.into_iter().unzip();
@@ -331,7 +331,7 @@ mod tests {
             let at = |p: usize| value((p % SIDE) as f32, (p / SIDE) as f32, t as f32 / n_phases as f32);
             Some(Image { width: SIDE, height: SIDE, values: (0..SIDE * SIDE).map(at).collect() })
         };
-        Series { view: 0, images: (0..n_phases).map(image).collect() }
+        Series { view: 0, images: (0..n_phases).map(image).collect(), vessels_alone: false }
     }
 
     /// A vessel that moves across the image at twice the rate of breathing.

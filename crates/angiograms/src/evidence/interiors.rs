@@ -124,7 +124,7 @@ mod tests {
             };
             Some(Image { width: SIDE, height: SIDE, values: (0..SIDE * SIDE).map(value).collect() })
         };
-        Background::new(Series { view: 0, images: (0..PHASES).map(image).collect() })
+        Background::new(Series { view: 0, images: (0..PHASES).map(image).collect(), vessels_alone: false })
     }
 
     #[test]
@@ -140,6 +140,17 @@ mod tests {
         let change = background.changes[0].as_ref().unwrap().values[ROW + 70];
         assert!((change - 1.0).abs() < 1e-5, "the vessel stands out as a whole, not by {change}");
         assert!((background.strongest - 1.0).abs() < 0.01, "{}", background.strongest);
+    }
+
+    #[test]
+    fn vessels_alone_have_no_background() {
+        let mut series = view(14.0, 3.0).stilled;
+        series.vessels_alone = true;
+        series.images.iter_mut().flatten().flat_map(|image| &mut image.values).for_each(|value| *value -= 1.0);
+        let background = Background::new(series);
+        assert!(background.level.values.iter().chain(&background.low.values).all(|value| *value == 0.0));
+        let change = background.changes[0].as_ref().unwrap().values[ROW + 25];
+        assert!((change - 1.0).abs() < 1e-6, "a vessel at rest stands out by {change}");
     }
 
     #[test]

@@ -18,6 +18,8 @@ pub struct Series {
     pub view: usize,
     /// An image per phase of the dataset, as large as the view's; `None` where the view has none.
     pub images: Vec<Option<Image>>,
+    /// Whether the images show vessels and nothing else.
+    pub vessels_alone: bool,
 }
 
 impl Series {
@@ -44,7 +46,8 @@ impl Series {
 
     /// Returns the training images of a view.
     pub fn of_view(dataset: &Dataset, view: usize) -> Series {
-        Series { view, images: (0..dataset.n_phases).map(|phase| mean_image(dataset, view, phase)).collect() }
+        let images = (0..dataset.n_phases).map(|phase| mean_image(dataset, view, phase)).collect();
+        Series { view, images, vessels_alone: dataset.vessels_alone }
     }
 
     /// Images of the phases the view has.

@@ -101,6 +101,9 @@ pub struct Manifest {
     /// without an image of it, from their images of phase 0. `phases` is 1 or 2.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub still: bool,
+    /// Whether the images show vessels and nothing else, as those that `import --gate-by-images` writes: their static background is 0.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub vessels_alone: bool,
     /// All images.
     pub frames: Vec<ManifestFrame>,
 }
@@ -232,6 +235,8 @@ pub struct Dataset {
     pub vessel_attenuation: Option<f64>,
     /// Whether the object is at rest: phase 0 shows it, and phase 1 is the same without vessels.
     pub still: bool,
+    /// Whether the images show vessels and nothing else (see [`Manifest::vessels_alone`]).
+    pub vessels_alone: bool,
     /// Whether the geometry of the views was adjusted with the vessels in the loop.
     pub views_adjusted: bool,
     /// Vessels that are known before the images are read.

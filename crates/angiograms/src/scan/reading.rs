@@ -65,6 +65,7 @@ impl Dataset {
         if manifest.still {
             builder.at_rest()?;
         }
+        builder.vessels_alone = manifest.vessels_alone;
         for (index, frame) in manifest.frames.iter().enumerate() {
             frame
                 .intensity

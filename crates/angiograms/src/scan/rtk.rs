@@ -58,6 +58,7 @@ pub fn import(geometry: &Path, projections: &Path, options: &RtkOptions, out: &P
         depth_half_extent_mm: options.depth_half_extent_mm,
         vessel_attenuation_per_mm: None,
         still: options.times.is_none(),
+        vessels_alone: false,
         size: [columns, rows],
         c_arm: unstated(),
     };

@@ -70,6 +70,7 @@ pub fn small_dataset(width: usize, height: usize, n_phases: u32) -> Result<Datas
         hidden: Default::default(),
         vessel_attenuation: Some(1.0),
         still: false,
+        vessels_alone: false,
         views_adjusted: false,
         prior: None,
         notes: Vec::new(),

@@ -29,6 +29,8 @@ pub struct About {
     pub vessel_attenuation_per_mm: Option<f64>,
     /// Whether the object is at rest (see [`Manifest::still`]); the authors' layout cannot state it.
     pub still: bool,
+    /// Whether the images show vessels and nothing else (see [`Manifest::vessels_alone`]); the authors' layout cannot state it.
+    pub vessels_alone: bool,
     /// Columns and rows of all images in the authors' layout, which states one size for all.
     pub size: [usize; 2],
     /// C-arm that gives the distances and pixels of the authors' layout, which states them once for all views.
@@ -71,6 +73,7 @@ impl<'a> Writer<'a> {
                 depth_half_extent_mm: about.depth_half_extent_mm,
                 vessel_attenuation_per_mm: about.vessel_attenuation_per_mm,
                 still: about.still,
+                vessels_alone: about.vessels_alone,
                 frames: Vec::new(),
             },
             general: nerfca::General {
@@ -274,6 +277,7 @@ pub fn write(
             depth_half_extent_mm: low.abs().max(high.abs()) * MM_PER_UNIT,
             vessel_attenuation_per_mm: dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),
             still: dataset.still,
+            vessels_alone: dataset.vessels_alone,
             size: dataset.canvas(),
             c_arm: dataset.reference_c_arm(),
         },

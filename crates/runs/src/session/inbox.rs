@@ -299,6 +299,7 @@ impl Inbox {
             depth_range: (-half, half),
             vessel_attenuation: self.options.vessel_attenuation_per_mm.map(|a| a * MM_PER_UNIT),
             still: self.options.still,
+            vessels_alone: false,
             views_adjusted: false,
             prior: self.prior.clone(),
             notes,

@@ -356,6 +356,7 @@ mod tests {
             hidden: Default::default(),
             vessel_attenuation: Some(PER_MM * MM_PER_UNIT),
             still: false,
+            vessels_alone: false,
             views_adjusted: false,
             prior: None,
         }
