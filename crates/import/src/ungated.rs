@@ -18,6 +18,12 @@ const MAX_FRAMES: usize = 300;
 /// than .5 mm, a pixel.
 const ONE_PLANE_DEG: f64 = 5.0;
 
+/// Displacement of the table across a view, mm, from which the images are compared with it: those of images are right to half a millimetre.
+const MIN_TABLE_MM: f64 = 2.0;
+/// Largest difference between the displacement of images and that of the table, as a share of the latter: a
+/// wrong axis, sign or unit makes a larger one.
+const TABLE_DIFFERS: f64 = 0.5;
+
 /// Place of a run in the common beat, and in the room.
 pub(super) struct Placed {
     /// Step of the run's own beat that is step 0 of the common one.
@@ -139,6 +145,11 @@ impl OneBeat {
             found.travel_mm(beat.clone(), mm),
             found.travel_mm(0..n, mm)
         ));
+        let seen: Vec<[f64; 2]> = found.displacements.iter().map(|d| d.map(|pixels| -f64::from(pixels) * mm)).collect();
+        notes.extend(
+            table_note(&stated_mm(c_arms, [frames[0].width, frames[0].height], mm), &seen)
+                .map(|note| format!("{name}: {note}")),
+        );
         let [columns, rows] = found.area.clone();
         let first = [columns.start, rows.start];
         let size = [columns.len(), rows.len()];
@@ -232,6 +243,41 @@ fn in_one_plane(directions: &[DVec3]) -> Option<String> {
     })
 }
 
+/// Places in the images of what lies at the isocentre at the first frame and is carried by the table, mm at the isocentre along columns and
+/// rows; empty where a C-arm has no rays.
+fn stated_mm(c_arms: &[CArm], size: [usize; 2], mm: f64) -> Vec<[f64; 2]> {
+    let place = |c_arm: &CArm| {
+        let rays = Geometry::CArm(c_arm.clone()).rays(size[0], size[1]).ok()?;
+        rays.project(DVec3::ZERO).map(|(column, row)| [column * mm, row * mm])
+    };
+    c_arms.iter().map(place).collect::<Option<Vec<_>>>().unwrap_or_default()
+}
+
+/// Compares the displacements of the table that a file states with those of the background of its images, mm; returns a note where the
+/// table moves.
+fn table_note(stated: &[[f64; 2]], seen: &[[f64; 2]]) -> Option<String> {
+    let from_first = |places: &[[f64; 2]], k: usize, axis: usize| places[k][axis] - places[0][axis];
+    let largest = |of: &dyn Fn(usize, usize) -> f64| {
+        (0..stated.len().min(seen.len())).flat_map(|k| [of(k, 0), of(k, 1)]).map(f64::abs).fold(0.0, f64::max)
+    };
+    let table = largest(&|k, axis| from_first(stated, k, axis));
+    if table < MIN_TABLE_MM {
+        return None;
+    }
+    let background = largest(&|k, axis| from_first(seen, k, axis));
+    let apart = largest(&|k, axis| from_first(stated, k, axis) - from_first(seen, k, axis));
+    Some(if apart <= TABLE_DIFFERS * table {
+        format!(
+            "the table moves by {table:.1} mm across the view as the file states it, which the images confirm to {apart:.1} mm"
+        )
+    } else {
+        format!(
+            "the table moves by {table:.1} mm across the view as the file states it, but the background of the images by {background:.1} mm, \
+             {apart:.1} mm from there at most: the displacement of the images is used. Compare the table positions with their source"
+        )
+    })
+}
+
 /// C-arm of a part of an image.
 fn cropped(c_arm: &CArm, whole: [usize; 2], first: [usize; 2], size: [usize; 2]) -> CArm {
     let offset = [0, 1].map(|k| {
@@ -249,6 +295,29 @@ fn part(image: &Image, columns: &Range<usize>, rows: &Range<usize>) -> Image {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn table_positions_are_compared_with_the_images() {
+        let c_arm = |along_mm: f64| CArm {
+            primary_deg: 20.0,
+            secondary_deg: 0.0,
+            sid_mm: 1000.0,
+            sod_mm: 700.0,
+            pixel_mm: [0.5; 2],
+            offset_mm: [0.0; 2],
+            table_mm: [0.0, 0.0, along_mm],
+        };
+        let at_isocentre = 0.5 * 700.0 / 1000.0;
+        let panned: Vec<CArm> = [0.0, 0.0, 4.0, 9.0].map(c_arm).to_vec();
+        let stated = stated_mm(&panned, [64, 64], at_isocentre);
+        // Rows count from the head's side, so that a patient who is moved towards the head moves up.
+        assert!((stated[3][1] - stated[0][1] + 9.0).abs() < 1e-6, "{stated:?}");
+        let seen: Vec<[f64; 2]> = stated.iter().map(|[column, row]| [column - 31.5, 0.9 * row]).collect();
+        assert!(table_note(&stated, &seen).is_some_and(|note| note.contains("confirm")));
+        let other: Vec<[f64; 2]> = stated.iter().map(|[column, row]| [*column, 2.0 * stated[0][1] - row]).collect();
+        assert!(table_note(&stated, &other).is_some_and(|note| note.contains("18.0 mm from there")));
+        assert_eq!(table_note(&stated_mm(&[c_arm(0.0), c_arm(0.0)], [64, 64], at_isocentre), &seen), None);
+    }
 
     #[test]
     fn views_in_one_plane_are_told() {
