@@ -283,3 +283,70 @@ fn the_ecg_of_a_waveform_is_found_among_its_channels() {
     let without = run(vec![waveform(&[("Lead I", even(0.0))], "-", "-")]);
     assert!(without.notes.join("\n").contains("waveform 1 was not used as an ECG: its SamplingFrequency is missing"));
 }
+
+#[test]
+fn a_field_of_view_that_is_turned_or_flipped_is_undone() {
+    let upright = read(|_| ()).unwrap();
+    let flipped = read(|o| put(o, tags::FIELD_OF_VIEW_HORIZONTAL_FLIP, VR::CS, "YES")).unwrap();
+    assert!(flipped.notes.iter().any(|note| note.contains("FieldOfViewHorizontalFlip")), "{:?}", flipped.notes);
+    let turned = read(|o| put(o, tags::FIELD_OF_VIEW_ROTATION, VR::IS, "180")).unwrap();
+    for (frame, stored) in upright.frames.iter().enumerate() {
+        for (p, value) in stored.iter().enumerate() {
+            let (x, y) = (p % upright.width, p / upright.width);
+            let beside = upright.width - 1 - x;
+            assert_eq!(flipped.frames[frame][y * upright.width + beside], *value);
+            assert_eq!(turned.frames[frame][(upright.height - 1 - y) * upright.width + beside], *value);
+        }
+    }
+    let quarter = read(|o| put(o, tags::FIELD_OF_VIEW_ROTATION, VR::IS, "90")).unwrap();
+    assert_eq!([quarter.width, quarter.height], [upright.height, upright.width]);
+    let [column_mm, row_mm] = upright.c_arms[0].pixel_mm;
+    assert_eq!(quarter.c_arms[0].pixel_mm, [row_mm, column_mm]);
+    for (tag, vr, text) in
+        [(tags::FIELD_OF_VIEW_ROTATION, VR::IS, "45"), (tags::FIELD_OF_VIEW_HORIZONTAL_FLIP, VR::CS, "MAYBE")]
+    {
+        let refused = read(|o| put(o, tag, vr, text)).unwrap_err().to_string();
+        assert!(refused.contains(text) && refused.contains("(0018,703"), "{refused}");
+    }
+}
+
+#[test]
+fn a_negative_image_is_inverted_once_whichever_attribute_states_it() {
+    let upright = read(|_| ()).unwrap();
+    let [photometric, sign] = [
+        (tags::PHOTOMETRIC_INTERPRETATION, VR::CS, "MONOCHROME1"),
+        (tags::PIXEL_INTENSITY_RELATIONSHIP_SIGN, VR::SS, "-1"),
+    ];
+    for stated in [vec![photometric], vec![sign], vec![photometric, sign]] {
+        let run = read(|o| {
+            for (tag, vr, text) in &stated {
+                if *vr == VR::SS {
+                    o.put(DataElement::new(*tag, *vr, PrimitiveValue::from(text.parse::<i16>().unwrap())));
+                } else {
+                    put(o, *tag, *vr, text);
+                }
+            }
+        })
+        .unwrap();
+        let white = upright.range.low + upright.range.white;
+        assert!(run.frames[0].iter().zip(&upright.frames[0]).all(|(now, value)| *now == white - value), "{stated:?}");
+    }
+}
+
+#[test]
+fn more_frames_than_stated_and_impossible_heart_rates_are_told() {
+    let run = read(|o| put(o, tags::NUMBER_OF_FRAMES, VR::IS, "4")).unwrap();
+    assert!(
+        run.notes.iter().any(|note| note.contains("holds 6 frames, but NumberOfFrames states 4")),
+        "{:?}",
+        run.notes
+    );
+    let run = read(|o| {
+        let every_2_ms = (0..20u8).map(|k| 2.0 * f32::from(k));
+        let peaks = PrimitiveValue::F32(every_2_ms.collect());
+        o.put(DataElement::new(tags::R_WAVE_TIME_VECTOR, VR::FL, peaks));
+    })
+    .unwrap();
+    assert!(run.r_peaks.is_none());
+    assert!(run.notes.iter().any(|note| note.contains("30000") && note.contains("20 to 300")), "{:?}", run.notes);
+}

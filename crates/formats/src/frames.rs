@@ -5,7 +5,8 @@ use crate::error::{Error, Result};
 use crate::files;
 use crate::image_limits::{MAX_FILE_BYTES, MAX_SIDE};
 use crate::raster::Image;
-use image::{DynamicImage, ImageFormat};
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageDecoder, ImageFormat};
 use std::io::Cursor;
 use std::path::Path;
 use tiff::ColorType;
@@ -25,6 +26,8 @@ pub struct GreyFrame {
     pub white: f32,
     /// Whether some pixel has a colour.
     pub is_coloured: bool,
+    /// Whether it was stored turned or mirrored, which was undone.
+    pub is_turned: bool,
 }
 
 /// Returns the format of a picture by the extension of its name.
@@ -61,8 +64,12 @@ fn picture(bytes: &[u8], format: ImageFormat) -> std::result::Result<Vec<GreyFra
     let mut limits = image::Limits::default();
     (limits.max_image_width, limits.max_image_height) = (Some(MAX_SIDE as u32), Some(MAX_SIDE as u32));
     reader.limits(limits);
-    let decoded = reader.decode().map_err(|e| e.to_string())?;
-    Ok(vec![grey(decoded)?])
+    let mut decoder = reader.into_decoder().map_err(|e| e.to_string())?;
+    // Viewers apply the orientation that EXIF data state.
+    let orientation = decoder.orientation().map_err(|e| e.to_string())?;
+    let mut decoded = DynamicImage::from_decoder(decoder).map_err(|e| e.to_string())?;
+    decoded.apply_orientation(orientation);
+    Ok(vec![GreyFrame { is_turned: orientation != Orientation::NoTransforms, ..grey(decoded)? }])
 }
 
 fn grey(decoded: DynamicImage) -> std::result::Result<GreyFrame, String> {
@@ -101,7 +108,7 @@ fn of_channels(values: &[f32], channels: usize, [width, height]: [usize; 2], whi
         _ => pixel[0],
     };
     let values = values.chunks_exact(channels).map(&mut luminance).collect();
-    GreyFrame { image: Image { width, height, values }, white, is_coloured }
+    GreyFrame { image: Image { width, height, values }, white, is_coloured, is_turned: false }
 }
 
 /// Reads all pages of a TIFF file.
@@ -152,5 +159,39 @@ fn pages(bytes: &[u8]) -> std::result::Result<Vec<GreyFrame>, String> {
             return Err(format!("has more than {MAX_PAGES} pages"));
         }
         decoder.next_image().map_err(told)?;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::ImageEncoder;
+    use image::codecs::jpeg::JpegEncoder;
+
+    /// EXIF data (a TIFF directory of one entry) with an orientation.
+    fn exif(orientation: u8) -> Vec<u8> {
+        let mut bytes = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".to_vec();
+        bytes.extend([orientation, 0, 0, 0, 0, 0, 0, 0]);
+        bytes
+    }
+
+    #[test]
+    fn the_orientation_of_a_jpeg_picture_is_applied() {
+        // Dark on the left, bright on the right, 16 columns and 8 rows.
+        let pixels: Vec<u8> = (0..16 * 8).map(|p| if p % 16 < 8 { 20 } else { 220 }).collect();
+        let stored = |orientation: u8| {
+            let mut bytes = Vec::new();
+            let mut encoder = JpegEncoder::new_with_quality(&mut bytes, 100);
+            encoder.set_exif_metadata(exif(orientation)).unwrap();
+            encoder.write_image(&pixels, 16, 8, image::ExtendedColorType::L8).unwrap();
+            picture(&bytes, ImageFormat::Jpeg).unwrap().remove(0)
+        };
+        let upright = stored(1);
+        assert_eq!((upright.image.width, upright.image.height, upright.is_turned), (16, 8, false));
+        // 6: the picture is to be turned clockwise by 90 degrees, which brings the left side to the top.
+        let turned = stored(6);
+        assert_eq!((turned.image.width, turned.image.height, turned.is_turned), (8, 16, true));
+        let row = |y: usize| turned.image.values[8 * y + 4];
+        assert!(row(2) < 60.0 && row(13) > 180.0, "{} {}", row(2), row(13));
     }
 }

@@ -165,7 +165,8 @@ impl Prepared {
                 pixels_per_pixel: factor,
             })),
             None => {
-                let problem = "are missing or are no UIDs, so that no references to this file can be kept";
+                let problem = "are missing or are no UIDs, or the images are stored turned or mirrored, so that no references to this file can be \
+                               kept";
                 Err(Error::data(&run.path, "UIDs of study, series, class and image", problem))
             }
         };

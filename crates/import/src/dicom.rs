@@ -7,6 +7,7 @@ use crate::error::{Error, Result};
 use crate::fingerprint::Fingerprint;
 use crate::frames::{self, Layout};
 use crate::geometry::CArm;
+use crate::orientation::{self, Orientation};
 use crate::reader::Reader;
 use crate::scan::gating::RPeaks;
 use crate::scan::references::SourceImage;
@@ -198,6 +199,9 @@ impl Run {
             Some(groups) => r.possible(groups.c_arms(stated, &mut notes)?, [width, height])?,
             None => r.c_arms(n, [width, height], stated, &mut notes)?,
         };
+        let orientation = Orientation::of(&r, groups.as_ref(), n)?;
+        notes.extend(orientation.note());
+        notes.extend(orientation::warnings(&r, &c_arms[0]));
         let times_s = match groups.as_ref().and_then(Groups::times_s) {
             Some(times_s) => times_s,
             None => timing::times(&r, n, &mut notes)?,
@@ -214,25 +218,33 @@ impl Run {
         let hashed = |tag| Fingerprint::of(r.text(tag).unwrap_or_default().as_bytes()).value();
         let identity = [tags::PATIENT_ID, tags::STUDY_INSTANCE_UID].map(hashed);
         let instance = r.text(tags::SOP_INSTANCE_UID).map(|uid| Fingerprint::of(uid.as_bytes()).value());
+        let stored = [width, height];
+        let open = match &groups {
+            Some(groups) => shared_area(groups.shutters()?.iter().map(|shutter| shutter.open_area(width, height)))?
+                .map_or_else(|| r.open_area(width, height), Ok)?,
+            None => r.open_area(width, height)?,
+        };
+        let [width, height] = orientation.sides(stored);
         Ok(Run {
             path: path.to_path_buf(),
             width,
             height,
-            frames,
+            frames: if orientation.is_upright() {
+                frames
+            } else {
+                frames.iter().map(|frame| orientation.image(frame, stored)).collect()
+            },
             range,
             relationship,
-            c_arms,
+            c_arms: c_arms.into_iter().map(|c_arm| orientation.c_arm(c_arm)).collect(),
             times_s,
             r_peaks,
-            open: match &groups {
-                Some(groups) => shared_area(groups.shutters()?.iter().map(|shutter| shutter.open_area(width, height)))?
-                    .map_or_else(|| r.open_area(width, height), Ok)?,
-                None => r.open_area(width, height)?,
-            },
+            open: orientation.area(open, stored),
             burnt_in: r.text(tags::BURNED_IN_ANNOTATION).is_some_and(|t| t.eq_ignore_ascii_case("YES")),
             identity,
             instance,
-            source: r.source([width, height]),
+            // References count pixels as they are stored.
+            source: r.source(stored).filter(|_| orientation.is_upright()),
             notes,
         })
     }
@@ -463,8 +475,17 @@ impl Reader<'_> {
             let problem = format!("gives values from {} to {}, which are no intensities", range.low, range.white);
             return Err(self.bad(tags::RESCALE_SLOPE, "the modality LUT", problem));
         }
-        if self.text(tags::PHOTOMETRIC_INTERPRETATION).as_deref() == Some("MONOCHROME1") {
-            notes.push("MONOCHROME1: the images were inverted, so that brighter pixels mean less absorption".into());
+        let photometric = self.text(tags::PHOTOMETRIC_INTERPRETATION).filter(|text| text == "MONOCHROME1");
+        // A value that is larger where less radiation arrives: a negative image, whichever of the two attributes states it.
+        let sign = self.number(tags::PIXEL_INTENSITY_RELATIONSHIP_SIGN, "PixelIntensityRelationshipSign")?;
+        let sign = sign.or(groups.and_then(Groups::relationship_sign)).filter(|sign| *sign < 0.0);
+        let sign = sign.map(|sign| format!("PixelIntensityRelationshipSign is {sign}"));
+        let negative: Vec<String> = photometric.into_iter().chain(sign).collect();
+        if !negative.is_empty() {
+            notes.push(format!(
+                "{}: the images were inverted, so that brighter pixels mean less absorption",
+                negative.join(", ")
+            ));
             frames.iter_mut().flatten().for_each(|v| *v = range.low + range.white - *v);
         }
         Ok((frames, range))

@@ -195,6 +195,12 @@ impl<'a> Groups<'a> {
         let properties = self.item(0, tags::FRAME_PIXEL_DATA_PROPERTIES_SEQUENCE).ok().flatten()?;
         properties.text(tags::PIXEL_INTENSITY_RELATIONSHIP)
     }
+
+    /// Returns the sign of that relationship, where it stands in the functional groups.
+    pub(super) fn relationship_sign(&self) -> Option<f64> {
+        let properties = self.item(0, tags::FRAME_PIXEL_DATA_PROPERTIES_SEQUENCE).ok().flatten()?;
+        properties.number(tags::PIXEL_INTENSITY_RELATIONSHIP_SIGN, "PixelIntensityRelationshipSign").ok()?
+    }
 }
 
 /// Second of the day of a date and time of DICOM, such as 20261126081500.250000+0100.

@@ -69,7 +69,10 @@ pub(super) fn decode(
                 decoders::caught(|| frames.par_iter().enumerate().map(decode).collect())?;
             decoded.into_iter().collect::<Result<_, String>>()?
         }
-        Value::Bytes { bytes, .. } if codec == Codec::Native => uncompressed(bytes, element, layout)?,
+        Value::Bytes { bytes, .. } if codec == Codec::Native => {
+            notes.extend(more_frames(bytes.len(), layout));
+            uncompressed(bytes, element, layout)?
+        }
         _ => return Err("is not compressed, though the transfer syntax says that it is".into()),
     };
     let values = |frame: Vec<u32>| -> Vec<f32> { frame.into_iter().map(|bits| layout.value(bits, codec)).collect() };
@@ -78,6 +81,17 @@ pub(super) fn decode(
         Some(i) => Err(format!("frame {}: has {} values where {} are needed", i + 1, frames[i].len(), layout.pixels())),
         None => Ok(frames),
     }
+}
+
+/// Returns a warning where pixel data hold more frames than the file states.
+fn more_frames(bytes: usize, layout: &Layout) -> Option<String> {
+    let held = bytes / (layout.pixels() * layout.bytes_per_value);
+    (held > layout.frames).then(|| {
+        format!(
+            "warning: PixelData holds {held} frames, but NumberOfFrames states {}, which are read: the others are left out",
+            layout.frames
+        )
+    })
 }
 
 fn uncompressed(bytes: &[u8], element: &Element, layout: &Layout) -> Result<Vec<Vec<u32>>, String> {

@@ -15,6 +15,7 @@ use crate::scan::writer::{About, Writer};
 use crate::stated::StatedGeometry;
 use crate::ungated::{self, OneBeat};
 use rayon::prelude::*;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 /// Largest accepted number of runs.
@@ -234,9 +235,30 @@ fn trainable(run: &Run, prepared: &Prepared, options: &ImportOptions) -> Result<
         .map_err(|found| Error::data(&run.path, found.field, format!("{}: {}", found.value, found.problem)))
 }
 
-/// Notes and warnings on differences between a run and the earlier runs.
+/// Fields of view at the isocentre that a C-arm shows, mm: its detector is 100 to 600 mm wide, and it magnifies by 1 to 2.
+const FIELDS_MM: Range<f64> = 30.0..600.0;
+
+/// Returns a warning on a field of view that no C-arm has.
+fn implausible_field(run: &Run) -> Option<String> {
+    let c_arm = run.c_arms.first()?;
+    let field_mm = run.width as f64 * c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm;
+    (!FIELDS_MM.contains(&field_mm)).then(|| {
+        format!(
+            "warning: {}: its {} columns of {} mm are {field_mm:.3} mm wide at the isocentre, and C-arms show {} to {} mm: is the pixel size \
+             stated in mm, at the detector?",
+            run.name(),
+            run.width,
+            c_arm.pixel_mm[0],
+            FIELDS_MM.start,
+            FIELDS_MM.end
+        )
+    })
+}
+
+/// Notes and warnings on a run alone and on differences between it and the earlier runs.
 fn check(run: &Run, before: &[AcceptedRun]) -> Vec<String> {
-    let (mut notes, name, this) = (Vec::new(), run.name(), AcceptedRun::of(run));
+    let (name, this) = (run.name(), AcceptedRun::of(run));
+    let mut notes: Vec<String> = implausible_field(run).into_iter().collect();
     let Some(first) = before.first() else { return notes };
     if this.identity[0] != first.identity[0] {
         notes.push(format!("warning: {name} belongs to another patient than {}", first.name));

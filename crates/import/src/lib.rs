@@ -13,6 +13,7 @@ mod enhanced;
 pub mod folder;
 mod frames;
 pub mod intake;
+mod orientation;
 pub mod pictures;
 mod reader;
 mod sources;

@@ -69,6 +69,54 @@ fn listed(folder: &Path) -> Result<(Vec<PathBuf>, usize)> {
     Ok((pictures, others))
 }
 
+/// Numbers of frames by the names of their files; none where names differ in more than a number.
+fn numbers(files: &[PathBuf]) -> Option<Vec<u64>> {
+    let split = |file: &PathBuf| {
+        let stem = file.file_stem()?.to_str()?;
+        let end = stem.rfind(|c: char| c.is_ascii_digit())? + 1;
+        let start = stem[..end].trim_end_matches(|c: char| c.is_ascii_digit()).len();
+        Some((stem[..start].to_owned(), stem[start..end].parse::<u64>().ok()?, stem[end..].to_owned()))
+    };
+    let parts = files.iter().map(split).collect::<Option<Vec<_>>>()?;
+    let alike = parts.windows(2).all(|pair| pair[0].0 == pair[1].0 && pair[0].2 == pair[1].2);
+    alike.then(|| parts.into_iter().map(|(_, number, _)| number).collect())
+}
+
+/// Places of frames in their run, from 0, by their numbers: a number that is missing is a frame that is missing. Frames follow each other
+/// where numbers do not tell.
+fn places(numbers: &[u64]) -> Vec<usize> {
+    let steps: Vec<u64> = numbers.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).collect();
+    let mut sorted = steps.clone();
+    sorted.sort_unstable();
+    let step = sorted.get(sorted.len() / 2).copied().unwrap_or(1);
+    if step == 0 || steps.iter().any(|other| *other == 0 || other % step != 0) {
+        return (0..numbers.len()).collect();
+    }
+    numbers.iter().map(|number| ((number - numbers[0]) / step) as usize).collect()
+}
+
+/// Returns the places of the frames in the files of a folder, and a warning where frames are missing.
+///
+/// # Errors
+/// [`Error::Data`] for two files of one number.
+fn placed(files: &[PathBuf]) -> Result<(Vec<usize>, Option<String>)> {
+    let Some(numbers) = numbers(files) else { return Ok(((0..files.len()).collect(), None)) };
+    if let Some(k) = (1..numbers.len()).find(|k| numbers[*k] == numbers[k - 1]) {
+        let problem = format!("has the number of {}: each frame is needed once", files[k - 1].display());
+        return Err(Error::data(&files[k], "name", problem));
+    }
+    let places = places(&numbers);
+    let missing = places.last().map_or(0, |last| last + 1) - places.len();
+    let gap = places.windows(2).position(|pair| pair[1] > pair[0] + 1);
+    let warning = gap.map(|k| {
+        format!(
+            "warning: {missing} frames are missing by the numbers in the names, the first after {}: the others keep their times",
+            files[k].file_name().unwrap_or_default().to_string_lossy()
+        )
+    });
+    Ok((places, warning))
+}
+
 /// Reads a view.
 ///
 /// # Errors
@@ -85,6 +133,8 @@ pub fn read(view: &PictureView, meaning: &PixelMeaning) -> Result<Run> {
     } else {
         vec![path.clone()]
     };
+    let (mut places, gap) = placed(&files)?;
+    notes.extend(gap);
     let mut frames: Vec<GreyFrame> = Vec::new();
     for file in &files {
         let more = frames::read(file)?;
@@ -117,9 +167,20 @@ pub fn read(view: &PictureView, meaning: &PixelMeaning) -> Result<Run> {
     if coloured > 0 {
         notes.push(format!("{coloured} of {} frames have colours, of which only the luminance is used", frames.len()));
     }
+    let turned = frames.iter().filter(|frame| frame.is_turned).count();
+    if turned > 0 {
+        notes.push(format!(
+            "{turned} of {} frames are stored turned or mirrored by their EXIF orientation, which was undone",
+            frames.len()
+        ));
+    }
     notes.push(format!("pixels are taken as {}; a pixel of {white} means no absorption", meaning.in_words()));
+    if places.len() != frames.len() {
+        // Files of several pages.
+        places = (0..frames.len()).collect();
+    }
     let times_s = match view.frames_per_s {
-        Some(rate) if rate.is_finite() && rate > 0.0 => (0..frames.len()).map(|i| i as f64 / rate).collect(),
+        Some(rate) if rate.is_finite() && rate > 0.0 => places.iter().map(|place| *place as f64 / rate).collect(),
         Some(rate) => return Err(Error::config("frames per second", rate, "is not a positive number")),
         None => Vec::new(),
     };
@@ -163,6 +224,23 @@ impl PixelMeaning {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn files(names: &[&str]) -> Vec<PathBuf> {
+        names.iter().map(PathBuf::from).collect()
+    }
+
+    #[test]
+    fn frames_that_are_missing_leave_a_gap() {
+        let of = |names: &[&str]| placed(&files(names)).unwrap();
+        assert_eq!(of(&["f8.png", "f9.png", "f10.png"]), (vec![0, 1, 2], None));
+        let (places, warning) = of(&["f01.png", "f02.png", "f04.png", "f05.png"]);
+        assert_eq!(places, [0, 1, 3, 4]);
+        assert!(warning.is_some_and(|text| text.contains("1 frames are missing") && text.contains("f02.png")));
+        assert_eq!(of(&["f10.png", "f20.png", "f30.png", "f50.png"]).0, [0, 1, 2, 4], "numbers in steps of ten");
+        assert_eq!(of(&["f10.png", "f43.png", "f77.png"]).0, [0, 1, 2], "times are no numbers of frames");
+        assert_eq!(of(&["a.png", "b1.png", "c7.png"]).0, [0, 1, 2]);
+        assert!(placed(&files(&["f1.jpg", "f1.png", "f2.png"])).is_err(), "one frame twice");
+    }
 
     #[test]
     fn names_are_ordered_as_people_count() {

@@ -116,11 +116,21 @@ pub struct RPeaks {
     times_s: Vec<f64>,
 }
 
+/// Refuses a heart rate that no patient has, beats per minute.
+fn check_rate(beats_per_min: f64, field: &'static str) -> Result<()> {
+    if (20.0..=300.0).contains(&beats_per_min) {
+        return Ok(());
+    }
+    let problem = "beats per minute are not in the accepted range, 20 to 300";
+    Err(Error::config(field, (100.0 * beats_per_min).round() / 100.0, problem))
+}
+
 impl RPeaks {
     /// Makes R-peaks from increasing times, seconds.
     ///
     /// # Errors
-    /// [`Error::Config`] for fewer than two times, and for times that are not finite or do not increase.
+    /// [`Error::Config`] for fewer than two times, for times that are not finite or do not increase, and for a median rate outside 20 to 300
+    /// beats per minute.
     pub fn new(times_s: &[f64]) -> Result<RPeaks> {
         if times_s.len() < 2 {
             return Err(Error::config("r_peaks", times_s.len(), "R-peaks are given, but at least two are needed"));
@@ -131,7 +141,9 @@ impl RPeaks {
         if let Some(w) = times_s.windows(2).find(|w| w[1] <= w[0]) {
             return Err(Error::config("r_peaks", w[1], format!("is not after {}: times must increase", w[0])));
         }
-        Ok(RPeaks { times_s: times_s.to_vec() })
+        let peaks = RPeaks { times_s: times_s.to_vec() };
+        check_rate(60.0 / peaks.beat_s(), "r_peaks")?;
+        Ok(peaks)
     }
 
     /// Makes R-peaks of a steady heart from `start_s` until they cover `end_s`.
@@ -139,13 +151,7 @@ impl RPeaks {
     /// # Errors
     /// [`Error::Config`] for a rate outside 20 to 300 beats per minute.
     pub fn steady(beats_per_min: f64, start_s: f64, end_s: f64) -> Result<RPeaks> {
-        if !(20.0..=300.0).contains(&beats_per_min) {
-            return Err(Error::config(
-                "heart rate",
-                beats_per_min,
-                "is not in the accepted range, 20 to 300 beats per minute",
-            ));
-        }
+        check_rate(beats_per_min, "heart rate")?;
         let beat = 60.0 / beats_per_min;
         let n = ((end_s - start_s).max(0.0) / beat).floor() as usize + 2;
         Self::new(&(0..n).map(|i| start_s + i as f64 * beat).collect::<Vec<_>>())
