@@ -1,7 +1,8 @@
 //! Units and spaces that files of other tools state: lengths come out in mm, and positions in LPS.
 
 use crate::python::python;
-use nertca_vk::formats::{nifti, vtp};
+use nertca_vk::formats::volume::VolumeHints;
+use nertca_vk::formats::{nifti, volume_files, vtp};
 use std::path::Path;
 
 /// Runs a script in Python with a directory as its argument, and returns its output.
@@ -121,5 +122,78 @@ fn lines_come_out_in_lps() {
         }
         let error = read("IJK").unwrap_err().to_string();
         assert!(error.contains("SPACE") && error.contains("`IJK`"), "{error}");
+    }
+}
+
+/// Writes volumes whose headers state where the data begin in several ways, and prints their values, spacing and origin as SimpleITK reads
+/// them.
+const PLACES: &str = r#"
+import gzip, sys, numpy, SimpleITK
+values = numpy.arange(24, dtype=numpy.float32) ** 2
+raw = values.tobytes()
+axes = "dimension: 3\nspace: left-posterior-superior\nsizes: 2 3 4\nspace directions: (0.5,0,0) (0,0.75,0) (0,0,1.5)\n"
+nrrd = "NRRD0004\ntype: float\n" + axes + "space origin: (-3,4,5)\nendian: little\n"
+mha = "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\n" \
+    + "Offset = -3 4 5\nDimSize = 2 3 4\nElementType = MET_FLOAT\n"
+files = {
+    "plain.nrrd": (nrrd + "encoding: raw\n\n").encode() + raw,
+    "bytes.nrrd": (nrrd + "encoding: raw\nbyte skip: 16\n\n").encode() + bytes(range(16)) + raw,
+    "last.nrrd": (nrrd + "encoding: raw\nbyte skip: -1\n\n").encode() + b"anything" + raw,
+    "lines.nrrd": (nrrd + "encoding: raw\nline skip: 2\n\n").encode() + b"one\ntwo\n" + raw,
+    "gzip-bytes.nrrd": (nrrd + "encoding: gzip\nbyte skip: 4\n\n").encode() + gzip.compress(b"abcd" + raw),
+    "named.nrrd": (nrrd + "encoding: raw\ncontent: a name\nkinds: domain domain domain\na key:=a value\n\n").encode() + raw,
+    "size.mha": (mha + "ElementSize = 0.5 0.75 1.5\nElementSpacing = 0.5 0.75 1.5\nElementDataFile = LOCAL\n").encode() + raw,
+    "origin.mha": (mha.replace("Offset", "Origin") + "ElementSpacing = 0.5 0.75 1.5\nElementDataFile = LOCAL\n").encode() + raw,
+}
+for name, data in files.items():
+    file = f"{sys.argv[1]}/{name}"
+    open(file, "wb").write(data)
+    seen = SimpleITK.ReadImage(file)
+    print(name, *seen.GetSpacing(), *seen.GetOrigin(), *SimpleITK.GetArrayFromImage(seen).ravel())
+# Files that SimpleITK reads in another way: in its units, as four axes, not at all.
+seen = [0.5, 0.75, 1.5, -3, 4, 5, *values]
+units = nrrd.replace("(0.5,0,0) (0,0.75,0) (0,0,1.5)", "(0.05,0,0) (0,0.075,0) (0,0,0.15)").replace("(-3,4,5)", "(-0.3,0.4,0.5)")
+list_of_one = nrrd.replace("dimension: 3", "dimension: 4").replace("sizes: ", "sizes: 1 ").replace("directions: ", "directions: none ")
+known = {
+    "cm.nrrd": (units + 'space units: "cm" "cm" "cm"\nencoding: raw\n\n').encode() + raw,
+    "list.nrrd": (list_of_one + "kinds: list domain domain domain\nencoding: raw\n\n").encode() + raw,
+    "crlf.nrrd": (nrrd + "encoding: raw\n\n").replace("\n", "\r\n").encode() + raw,
+    "element-size.mha": (mha + "ElementSize = 0.5 0.75 1.5\nElementDataFile = LOCAL\n").encode() + raw,
+    "header.mha": (mha + "HeaderSize = -1\nElementSpacing = 0.5 0.75 1.5\nElementDataFile = LOCAL\n").encode() + b"anything" + raw,
+}
+for name, data in known.items():
+    open(f"{sys.argv[1]}/{name}", "wb").write(data)
+    print(name, *seen)
+refused = {
+    "unknown.nrrd": (nrrd + "encoding: raw\nmirror: x\n\n").encode() + raw,
+    "unit.nrrd": (nrrd + 'space units: "ell" "ell" "ell"\nencoding: raw\n\n').encode() + raw,
+    "channels.mha": (mha + "ElementNumberOfChannels = 3\nElementSpacing = 1 1 1\nElementDataFile = LOCAL\n").encode() + raw,
+    "text.mha": (mha.replace("BinaryData = True", "BinaryData = False") + "ElementSpacing = 1 1 1\nElementDataFile = LOCAL\n").encode() + raw,
+}
+for name, data in refused.items():
+    open(f"{sys.argv[1]}/{name}", "wb").write(data)
+    print(name)
+"#;
+
+#[test]
+fn header_fields_that_move_the_data_are_read_or_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let seen = run(PLACES, directory.path());
+    assert_eq!(seen.lines().count(), 17);
+    for line in seen.lines() {
+        let (name, numbers) = line.split_once(' ').unwrap_or((line, ""));
+        let read = volume_files::read(&directory.path().join(name), &VolumeHints::default());
+        if numbers.is_empty() {
+            assert!(read.is_err(), "{name} is refused");
+            continue;
+        }
+        let volume = read.unwrap();
+        let m = volume.index_to_lps.matrix3;
+        let lengths = [m.x_axis, m.y_axis, m.z_axis].map(|axis| axis.length() as f32);
+        let origin = volume.index_to_lps.translation.as_vec3().to_array();
+        let found = [&lengths[..], &origin, &volume.values].concat();
+        let want: Vec<f32> = numbers.split(' ').map(|number| number.parse().unwrap()).collect();
+        assert!(found.iter().zip(&want).all(|(found, want)| (found - want).abs() < 1e-5), "{name}: {found:?} {want:?}");
+        assert_eq!(found.len(), want.len(), "{name}");
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::files;
+use crate::nrrd::length_mm;
 use crate::raw::{self, ByteOrder, Element};
 use crate::volume::{MAX_BYTES, Volume, VolumeHeader, affine, numbers};
 use glam::DVec3;
@@ -44,6 +45,7 @@ pub fn read(path: &Path) -> Result<Volume> {
             .find_map(|l| l.split_once('=').filter(|(k, _)| k.trim() == name).map(|(_, v)| v.trim().to_owned()))
     };
     let need = |name: &str| field(name).ok_or_else(|| bad(name, "is missing".into()));
+    refuse_what_is_not_read(path, field)?;
     let says_true = |name: &str| field(name).is_some_and(|v| v.eq_ignore_ascii_case("true"));
     if need(DATA)? != "LOCAL" {
         return Err(bad(DATA, "data in a separate file are not supported; use .mha with LOCAL data".into()));
@@ -53,7 +55,7 @@ pub fn read(path: &Path) -> Result<Volume> {
     let kind = need("ElementType")?;
     let element = element_of(&kind).ok_or_else(|| bad("ElementType", format!("`{kind}` is not supported")))?;
     let voxels = size.iter().product::<usize>();
-    let body = &bytes[end + 1..];
+    let body = after_header(path, &bytes[end + 1..], field("HeaderSize").as_deref(), voxels * element.bytes())?;
     let data = match says_true("CompressedData") {
         true => raw::read_at_most(flate2::read::ZlibDecoder::new(body), voxels * element.bytes())
             .map_err(|e| bad("CompressedData", e.to_string()))?,
@@ -61,8 +63,16 @@ pub fn read(path: &Path) -> Result<Volume> {
     };
     let big = says_true("BinaryDataByteOrderMSB") || says_true("ElementByteOrderMSB");
     let values = element.decode(path, if big { ByteOrder::Big } else { ByteOrder::Little }, &data, voxels)?;
-    let spacing = numbers(path, "ElementSpacing", &need("ElementSpacing")?)?;
-    let rotation = match field("TransformMatrix") {
+    // Files that state the size of a voxel have no gaps between voxels.
+    let spacing = match field("ElementSpacing").or_else(|| field("ElementSize")) {
+        Some(text) => numbers(path, "ElementSpacing", &text)?,
+        None => return Err(bad("ElementSpacing", "is missing".into())),
+    };
+    let unit = field("DistanceUnits").unwrap_or_else(|| "mm".into());
+    let unit_mm = length_mm(&unit).ok_or_else(|| {
+        bad("DistanceUnits", format!("`{unit}` is no unit of length that is known: m, cm, mm and um are"))
+    })?;
+    let rotation = match field("TransformMatrix").or_else(|| field("Rotation")).or_else(|| field("Orientation")) {
         Some(text) => numbers(path, "TransformMatrix", &text)?,
         None => vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
     };
@@ -70,11 +80,45 @@ pub fn read(path: &Path) -> Result<Volume> {
         return Err(bad("ElementSpacing", "three numbers are needed, and nine for TransformMatrix".into()));
     }
     let columns: Vec<f64> = (0..9).map(|i| rotation[i] * spacing[i / 3]).collect();
-    let origin = match field("Offset").or_else(|| field("Position")) {
+    let origin = match field("Offset").or_else(|| field("Position")).or_else(|| field("Origin")) {
         Some(text) => numbers(path, "Offset", &text)?,
         None => vec![0.0; 3],
     };
-    Ok(Volume { size, values, index_to_lps: affine(path, "TransformMatrix", &columns, &origin, DVec3::ONE)? })
+    Ok(Volume {
+        size,
+        values,
+        index_to_lps: affine(path, "TransformMatrix", &columns, &origin, DVec3::splat(unit_mm))?,
+    })
+}
+
+/// Refuses fields that change the meaning of the values in a way that is not read. Other fields, and those that a program adds, say nothing
+/// about the place or the value of a voxel: ITK passes over them, too.
+fn refuse_what_is_not_read(path: &Path, field: impl Fn(&str) -> Option<String>) -> Result<()> {
+    let expected: [(&str, &[&str]); 4] = [
+        ("BinaryData", &["true"]),
+        ("ElementNumberOfChannels", &["1"]),
+        ("ElementToIntensityFunctionSlope", &["1", "1.0"]),
+        ("ElementToIntensityFunctionOffset", &["0", "0.0"]),
+    ];
+    for (name, accepted) in expected {
+        if let Some(stated) = field(name).filter(|stated| !accepted.contains(&&*stated.to_lowercase())) {
+            let problem = format!("`{stated}` is not supported; {} is", accepted[0]);
+            return Err(Error::data(path, name, problem));
+        }
+    }
+    Ok(())
+}
+
+/// Returns the data after what `HeaderSize` states: so many bytes, or, with -1, all but the last `expected` ones.
+fn after_header<'a>(path: &Path, body: &'a [u8], stated: Option<&str>, expected: usize) -> Result<&'a [u8]> {
+    let Some(text) = stated else { return Ok(body) };
+    let first = match text.parse::<i64>() {
+        Ok(-1) => body.len().checked_sub(expected),
+        Ok(bytes) => usize::try_from(bytes).ok(),
+        Err(_) => None,
+    };
+    let rest = first.and_then(|first| body.get(first..));
+    rest.ok_or_else(|| Error::data(path, "HeaderSize", format!("`{text}` bytes cannot be passed over")))
 }
 
 fn element_of(kind: &str) -> Option<Element> {

@@ -145,6 +145,193 @@ pub fn write(path: &Path, volume: &Volume, quantity: &str) -> Result<()> {
     })
 }
 
+/// Fields of the format (teem.sourceforge.net/nrrd/format.html, section 4) that decide where values are and what they mean.
+const USED: [&str; 12] = [
+    "dimension",
+    "sizes",
+    "type",
+    "encoding",
+    "endian",
+    "line skip",
+    "byte skip",
+    "space",
+    "space directions",
+    "space origin",
+    "space units",
+    "kinds",
+];
+/// Fields that say nothing about the place or the value of a voxel beside the fields that are used.
+const HARMLESS: [&str; 18] = [
+    "space dimension",
+    "content",
+    "number",
+    "block size",
+    "min",
+    "max",
+    "old min",
+    "old max",
+    "sample units",
+    "centers",
+    "centerings",
+    "labels",
+    "units",
+    "spacings",
+    "thicknesses",
+    "axis mins",
+    "axis maxs",
+    "measurement frame",
+];
+
+/// Fields of a header, by their names without spaces.
+struct Fields<'a> {
+    path: &'a Path,
+    values: Vec<(String, String)>,
+}
+
+impl Fields<'_> {
+    /// Reads a header.
+    ///
+    /// # Errors
+    /// [`Error::Data`] naming the field, for one that may move or turn the data and is not known.
+    fn of<'a>(path: &'a Path, header: &str) -> Result<Fields<'a>> {
+        let mut values = Vec::new();
+        let lines = header.lines().skip(1).filter(|line| !line.starts_with('#') && !line.is_empty());
+        for line in lines.filter(|line| !line.contains(":=")) {
+            let (name, value) = line
+                .split_once(':')
+                .ok_or_else(|| Error::data(path, "header", format!("`{line}` is neither a field nor a comment")))?;
+            let (name, value) = (name.trim().to_lowercase(), value.trim().to_owned());
+            match &*name {
+                "data file" | "datafile" => {
+                    let problem = "data in a separate file are not supported; put them into this file";
+                    return Err(Error::data(path, "data file", problem));
+                }
+                known if is_among(known, &USED) => values.push((compact(known), value)),
+                known if is_among(known, &HARMLESS) => {}
+                other => return Err(Error::data(path, other, "is no field of an NRRD volume that is known here")),
+            }
+        }
+        Ok(Fields { path, values })
+    }
+
+    fn get(&self, name: &str) -> Option<&str> {
+        let name = compact(name);
+        self.values.iter().find(|(other, _)| *other == name).map(|(_, value)| value.as_str())
+    }
+
+    fn need(&self, name: &'static str) -> Result<&str> {
+        self.get(name).ok_or_else(|| Error::data(self.path, name, "is missing"))
+    }
+
+    fn number(&self, name: &'static str) -> Result<i64> {
+        let Some(text) = self.get(name) else { return Ok(0) };
+        text.parse().map_err(|_| Error::data(self.path, name, format!("`{text}` is no whole number")))
+    }
+
+    /// Sizes of the three axes in space, and the vectors of these axes. A list of one volume, as 3D Slicer writes it, has one more axis.
+    fn axes(&self) -> Result<(Vec<u64>, Vec<f64>)> {
+        let sizes = numbers(self.path, "sizes", self.need("sizes")?)?;
+        let directions = self.need("space directions")?.replace(')', ") ");
+        let directions: Vec<&str> = directions.split_inclusive([')']).flat_map(words_outside).collect();
+        let is_list = |axis: usize| directions.get(axis).is_some_and(|vector| *vector == "none");
+        let (mut kept, mut vectors) = (Vec::new(), Vec::new());
+        for (axis, size) in sizes.iter().enumerate() {
+            if is_list(axis) && *size == 1.0 {
+                continue;
+            }
+            kept.push(*size as u64);
+            if let Some(vector) = directions.get(axis) {
+                vectors.extend(numbers(self.path, "space directions", vector)?);
+            }
+        }
+        Ok((kept, vectors))
+    }
+
+    /// Signs that lead from the file's space to LPS.
+    fn signs(&self) -> Result<DVec3> {
+        match &*self.need("space")?.to_lowercase() {
+            "left-posterior-superior" | "lps" => Ok(DVec3::ONE),
+            "right-anterior-superior" | "ras" => Ok(DVec3::new(-1.0, -1.0, 1.0)),
+            "left-anterior-superior" | "las" => Ok(DVec3::new(1.0, -1.0, 1.0)),
+            other => Err(Error::data(self.path, "space", format!("`{other}` is not supported; LPS, RAS and LAS are"))),
+        }
+    }
+
+    /// Length of the unit along each axis of space, mm.
+    fn units_mm(&self) -> Result<DVec3> {
+        let Some(text) = self.get("space units") else { return Ok(DVec3::ONE) };
+        let units: Vec<&str> = text.split(['"', ' ']).filter(|unit| !unit.is_empty()).collect();
+        let mm = |unit: &&str| {
+            length_mm(unit).ok_or_else(|| {
+                let problem = format!("`{unit}` is no unit of length that is known: m, cm, mm and um are");
+                Error::data(self.path, "space units", problem)
+            })
+        };
+        match units.iter().map(mm).collect::<Result<Vec<f64>>>()?[..] {
+            [x, y, z] => Ok(DVec3::new(x, y, z)),
+            _ => Err(Error::data(self.path, "space units", format!("`{text}` does not have three units"))),
+        }
+    }
+
+    /// Returns the stored data after the lines and bytes that are to be skipped; `expected` is their number without a compression.
+    fn data(&self, body: &[u8], expected: usize) -> Result<Vec<u8>> {
+        let bad = |field: &str, problem: String| Error::data(self.path, field, problem);
+        let (lines, bytes) = (self.number("line skip")?, self.number("byte skip")?);
+        if lines < 0 || bytes < -1 {
+            return Err(bad("line skip", format!("{lines} lines and {bytes} bytes cannot be skipped")));
+        }
+        let mut body = body;
+        for _ in 0..lines {
+            let end = body.iter().position(|byte| *byte == b'\n');
+            body = &body[end.ok_or_else(|| bad("line skip", format!("there are no {lines} lines")))? + 1..];
+        }
+        let after = |data: &[u8]| {
+            let rest = data.get(bytes as usize..).map(<[u8]>::to_vec);
+            rest.ok_or_else(|| bad("byte skip", format!("there are no {bytes} bytes to skip")))
+        };
+        match self.need("encoding")? {
+            "raw" if bytes == -1 => {
+                let first = body.len().checked_sub(expected);
+                first.map(|first| body[first..].to_vec()).ok_or_else(|| bad("data", "are too short".into()))
+            }
+            "raw" => after(body),
+            "gzip" | "gz" if bytes == -1 => Err(bad("byte skip", "of -1 is for raw data alone".into())),
+            "gzip" | "gz" => {
+                let all = expected.saturating_add(bytes as usize);
+                let data = raw::read_at_most(flate2::read::MultiGzDecoder::new(body), all);
+                after(&data.map_err(|e| bad("gzip", e.to_string()))?)
+            }
+            other => Err(bad("encoding", format!("`{other}` is not supported; raw and gzip are"))),
+        }
+    }
+}
+
+/// Returns the name of a field without spaces: most fields have a spelling with and one without.
+fn compact(name: &str) -> String {
+    name.replace(' ', "")
+}
+
+fn is_among(name: &str, fields: &[&str]) -> bool {
+    fields.iter().any(|field| compact(field) == compact(name))
+}
+
+/// Splits a text into a vector in brackets and the words `none` before it.
+fn words_outside(text: &str) -> Vec<&str> {
+    let (before, vector) = text.split_at(text.find('(').unwrap_or(text.len()));
+    before.split_whitespace().chain(Some(vector.trim()).filter(|vector| !vector.is_empty())).collect()
+}
+
+/// Length of a unit, mm.
+pub(super) fn length_mm(unit: &str) -> Option<f64> {
+    match unit {
+        "m" | "meter" | "metre" => Some(1e3),
+        "cm" => Some(10.0),
+        "mm" | "millimeter" | "millimetre" => Some(1.0),
+        "um" | "\u{b5}m" | "\u{3bc}m" | "micron" | "micrometer" => Some(1e-3),
+        _ => None,
+    }
+}
+
 /// Reads a 3D volume.
 ///
 /// # Errors
@@ -152,43 +339,25 @@ pub fn write(path: &Path, volume: &Volume, quantity: &str) -> Result<()> {
 pub fn read(path: &Path) -> Result<Volume> {
     let bytes = files::read_limited(path, MAX_BYTES)?;
     let bad = |field: &str, problem: String| Error::data(path, field, problem);
-    let end = bytes.windows(2).position(|w| w == b"\n\n").ok_or_else(|| bad("header", "has no end".into()))?;
+    // Lines may end with a carriage return as well.
+    let ends = [&b"\n\n"[..], b"\n\r\n"].map(|end| Some((bytes.windows(end.len()).position(|w| w == end)?, end.len())));
+    let (end, length) = ends.into_iter().flatten().min().ok_or_else(|| bad("header", "has no end".into()))?;
     let header = String::from_utf8_lossy(&bytes[..end]).replace('\r', "");
     if !header.starts_with("NRRD") {
         return Err(bad("header", "does not start with NRRD".into()));
     }
-    let field = |name: &str| {
-        header.lines().find_map(|l| l.split_once(':').filter(|(k, _)| *k == name).map(|(_, v)| v.trim().to_owned()))
-    };
-    let need = |name: &str| field(name).ok_or_else(|| bad(name, "is missing".into()));
-    if field("data file").is_some() || field("datafile").is_some() {
-        return Err(bad("data file", "data in a separate file are not supported; put them into this file".into()));
-    }
-    let sizes: Vec<u64> = numbers(path, "sizes", &need("sizes")?)?.iter().map(|v| *v as u64).collect();
+    let fields = Fields::of(path, &header)?;
+    let (sizes, directions) = fields.axes()?;
     let size = Volume::check_size(path, "sizes", &sizes)?;
-    let kind = need("type")?;
-    let element = element_of(&kind).ok_or_else(|| bad("type", format!("`{kind}` is not supported")))?;
+    let kind = fields.need("type")?;
+    let element = element_of(kind).ok_or_else(|| bad("type", format!("`{kind}` is not supported")))?;
     let voxels = size.iter().product::<usize>();
-    let body = &bytes[end + 2..];
-    let data = match need("encoding")?.as_str() {
-        "raw" => body.to_vec(),
-        "gzip" | "gz" => raw::read_at_most(flate2::read::MultiGzDecoder::new(body), voxels * element.bytes())
-            .map_err(|e| bad("gzip", e.to_string()))?,
-        other => return Err(bad("encoding", format!("`{other}` is not supported; raw and gzip are"))),
-    };
-    let order = if field("endian").as_deref() == Some("big") { ByteOrder::Big } else { ByteOrder::Little };
+    let data = fields.data(&bytes[end + length..], voxels * element.bytes())?;
+    let order = if fields.get("endian") == Some("big") { ByteOrder::Big } else { ByteOrder::Little };
     let values = element.decode(path, order, &data, voxels)?;
-    let flip = match need("space")?.to_lowercase().as_str() {
-        "left-posterior-superior" | "lps" => DVec3::ONE,
-        "right-anterior-superior" | "ras" => DVec3::new(-1.0, -1.0, 1.0),
-        "left-anterior-superior" | "las" => DVec3::new(1.0, -1.0, 1.0),
-        other => {
-            return Err(bad("space", format!("`{other}` is not supported; LPS, RAS and LAS are")));
-        }
-    };
-    let directions = numbers(path, "space directions", &need("space directions")?)?;
-    let origin = numbers(path, "space origin", &need("space origin")?)?;
-    Ok(Volume { size, values, index_to_lps: affine(path, "space directions", &directions, &origin, flip)? })
+    let origin = numbers(path, "space origin", fields.need("space origin")?)?;
+    let to_lps = fields.signs()? * fields.units_mm()?;
+    Ok(Volume { size, values, index_to_lps: affine(path, "space directions", &directions, &origin, to_lps)? })
 }
 
 fn element_of(kind: &str) -> Option<Element> {
