@@ -36,7 +36,7 @@
 #define NERTCA_INTENSITY_INTEGRAL 1
 
 /**
- * Logarithmic detector: the line integral is `(i0 - p) * scale`.
+ * Logarithmic detector: the line integral is `(i0 - p) * scale`; `i0` is positive.
  */
 #define NERTCA_INTENSITY_LOG 2
 

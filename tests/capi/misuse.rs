@@ -386,6 +386,7 @@ fn frames(b: &Bench) {
         ("offset", Box::new(|f| f.offset = f64::INFINITY)),
         ("i0", Box::new(|f| (f.intensity, f.i0) = (NERTCA_INTENSITY_LINEAR, 0.0))),
         ("i0", Box::new(|f| (f.intensity, f.i0) = (NERTCA_INTENSITY_LOG, f64::NAN))),
+        ("i0", Box::new(|f| (f.intensity, f.i0) = (NERTCA_INTENSITY_LOG, 0.0))),
         ("phase", Box::new(|f| f.phase = 3)),
         ("phase", Box::new(|f| f.phase = i32::MAX)),
         ("time", Box::new(|f| (f.phase, f.time_s) = (-1, f64::NAN))),

@@ -124,6 +124,30 @@ fn train_says_whether_the_views_agree() {
 }
 
 #[test]
+fn a_refused_command_leaves_what_it_was_given_as_it_was() {
+    let directory = tempfile::tempdir().unwrap();
+    let (data, run) = (small_phantom(directory.path(), &[]), directory.path().join("run"));
+    ok(&[&["train", text(&data), "-o", text(&run)], &SHORT[..]].concat());
+    let other = small_phantom(&directory.path().join("other"), &["--seed", "2"]);
+    let files = |of: &Path| -> Vec<(PathBuf, Vec<u8>)> {
+        let mut all: Vec<PathBuf> = std::fs::read_dir(of).unwrap().map(|entry| entry.unwrap().path()).collect();
+        all.retain(|file| file.is_file());
+        all.sort();
+        all.into_iter().map(|file| (file.clone(), std::fs::read(&file).unwrap())).collect()
+    };
+    let refused = |args: &[&str], of: &Path, reason: &str| {
+        let before = files(of);
+        let answer = nertca(args);
+        let said = String::from_utf8_lossy(&answer.stderr).into_owned();
+        assert!(!answer.status.success() && said.contains(reason), "{args:?}: {said}");
+        assert!(files(of) == before, "{args:?} changed {}", of.display());
+    };
+    refused(&["train", text(&other), "-o", text(&run), "--resume"], &run, "dataset");
+    refused(&["train", text(&data), "-o", text(&data)], &data, "is the directory of a dataset");
+    refused(&["train", text(&data), "-o", text(&run), "--force", "--stop-at", "0"], &run, "--stop-at");
+}
+
+#[test]
 fn iterations_without_effect_on_the_vessels_are_told() {
     let directory = tempfile::tempdir().unwrap();
     let (data, run) = (small_phantom(directory.path(), &[]), directory.path().join("run"));

@@ -15,7 +15,7 @@ pub const NERTCA_PIXELS_F32: u32 = 3;
 
 /// Pixel values `p` are line integrals of attenuation: `p * scale + offset`.
 pub const NERTCA_INTENSITY_INTEGRAL: u32 = 1;
-/// Logarithmic detector: the line integral is `(i0 - p) * scale`.
+/// Logarithmic detector: the line integral is `(i0 - p) * scale`; `i0` is positive.
 pub const NERTCA_INTENSITY_LOG: u32 = 2;
 /// Detector linear in intensity: the line integral is `-ln(p / i0)`.
 pub const NERTCA_INTENSITY_LINEAR: u32 = 3;
@@ -675,9 +675,11 @@ impl nertca_frame {
         let intensity = match self.intensity {
             NERTCA_INTENSITY_INTEGRAL => Intensity::Integral { scale, offset: finite("offset", self.offset)? },
             // (i0 - p) * scale = p * -scale + i0 * scale
+            NERTCA_INTENSITY_LOG | NERTCA_INTENSITY_LINEAR if self.i0 <= 0.0 => {
+                return Err(Failure::argument("i0", format!("{} is not positive", self.i0)));
+            }
             NERTCA_INTENSITY_LOG => Intensity::Integral { scale: -scale, offset: finite("i0", self.i0)? * scale },
-            NERTCA_INTENSITY_LINEAR if self.i0 > 0.0 && self.i0.is_finite() => Intensity::Linear { i0: self.i0 },
-            NERTCA_INTENSITY_LINEAR => return Err(Failure::argument("i0", format!("{} is not positive", self.i0))),
+            NERTCA_INTENSITY_LINEAR => Intensity::Linear { i0: finite("i0", self.i0)? },
             other => return Err(Failure::argument("intensity", format!("{other} is not one of NERTCA_INTENSITY_*"))),
         };
         let mut integrals = Vec::with_capacity(width * height);

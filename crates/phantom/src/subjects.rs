@@ -310,6 +310,16 @@ impl Reading<'_> {
         if self.hounsfield {
             voxels::attenuation_from_hounsfield(&mut volume);
         }
+        // Attenuation is positive; a chest in Hounsfield units is mostly air, which is negative.
+        if volume.values.iter().map(|value| f64::from(*value)).sum::<f64>() < 0.0 {
+            let [low, high] =
+                volume.values.iter().fold([f32::MAX, f32::MIN], |[low, high], v| [low.min(*v), high.max(*v)]);
+            let problem = format!(
+                "are {low} to {high}, mostly negative, which is no attenuation per mm: --hounsfield converts Hounsfield units, --scale other \
+                 units"
+            );
+            return Err(Error::data(path, "values", problem));
+        }
         Ok(volume)
     }
 

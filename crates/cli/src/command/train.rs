@@ -15,7 +15,7 @@ use nertca_vk::files::{self, Lock};
 use nertca_vk::formats::nrrd;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::scan::dataset::{Dataset, MANIFEST};
 use nertca_vk::scan::prior::{PRIOR, VesselPrior};
 use nertca_vk_runs::run::events::Event;
 use nertca_vk_runs::run::info::RunInfo;
@@ -23,6 +23,7 @@ use nertca_vk_runs::run::prior;
 use nertca_vk_runs::run::reconstruct::{CONFIG, RunOptions, reconstruct};
 use nertca_vk_runs::run::score::{ScoreOptions, as_trained, evaluate_model};
 use nertca_vk_vessels::score::eval::{Evaluation, moving_field_warning};
+use std::cell::RefCell;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -52,7 +53,7 @@ pub struct TrainArgs {
     #[arg(long, conflicts_with_all = ["preset", "config", "set", "iterations", "seed"])]
     pub resume: bool,
     /// Save and stop after N iterations; schedules are computed for the full length.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub stop_at: Option<u32>,
     /// Print one JSON object per line on stdout instead of a progress bar.
     #[arg(long)]
@@ -108,6 +109,10 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     if let Some(file) = &args.export_hull {
         return export_hull(&config, &dataset, file);
     }
+    if run.join(MANIFEST).exists() {
+        let problem = "is the directory of a dataset; a run has a directory of its own";
+        return Err(Error::config("--out", run.display(), problem));
+    }
     // A run that is to be resumed must exist.
     let _lock = if args.resume && !run.exists() { None } else { Some(take_run(run)?) };
     prepare_directory(run, args)?;
@@ -115,18 +120,27 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     dataset.prior = kept_prior(prior, run, args)?;
     let cancel = stop_flag()?;
     let gpu = global.open_device()?;
-    RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) }.write(run)?;
+    let info = RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) };
+    if !args.resume {
+        info.write(run)?;
+    }
+    let written = RefCell::new(Ok(()));
     let (config, resume) = if args.resume { resumed(run)? } else { (config, false) };
     let tuning = global.training_tuning(&gpu, &config, &dataset)?;
     let options = RunOptions { tuning: &tuning, run, resume, stop_at: args.stop_at, cancel: &cancel };
     let mut show: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
     let mut observer = |event: &Event| {
         if let Event::Started { .. } = event {
+            // A run that is resumed keeps its record until the dataset was found to be that of its checkpoint.
+            if args.resume {
+                *written.borrow_mut() = info.write(run);
+            }
             return_freed();
         }
         show(event);
     };
     reconstruct(&gpu, &config, &dataset, &options, &mut observer)?;
+    written.replace(Ok(()))?;
     let dataset = as_trained(dataset, run)?;
     let report = run.join("report");
     let (model, page) = (newest_model(run)?, run.join("report.html"));
