@@ -13,6 +13,8 @@ use std::ops::Range;
 const NO_TURN_DEG: f64 = 0.5;
 /// Primary angle, degrees, up to which the columns of an image run towards the patient's left.
 const FROM_THE_FRONT_DEG: f64 = 60.0;
+/// Distance of the field of view from the middle of the detector, mm, that is not worth a warning: a few pixels.
+const MIDDLE_MM: f64 = 1.0;
 
 /// Rotation and flip by which a stored image differs from that of the detector.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -152,9 +154,6 @@ pub(super) fn warnings(run: &Reader<'_>, c_arm: &CArm) -> Vec<String> {
     });
     mirrored.into_iter().chain(off_the_middle(run)).collect()
 }
-
-/// Distance of the field of view from the middle of the detector, mm, that is not worth a warning: a few pixels.
-const MIDDLE_MM: f64 = 1.0;
 
 /// Returns a warning where the file states that the field of view is not in the middle of the detector.
 fn off_the_middle(run: &Reader<'_>) -> Option<String> {
