@@ -240,7 +240,7 @@ impl Fields<'_> {
                 continue;
             }
             kept.push(*size as u64);
-            if let Some(vector) = directions.get(axis) {
+            if let Some(vector) = directions.get(axis).filter(|_| !is_list(axis)) {
                 vectors.extend(numbers(self.path, "space directions", vector)?);
             }
         }
