@@ -159,6 +159,7 @@ known = {
     "list.nrrd": (list_of_one + "kinds: list domain domain domain\nencoding: raw\n\n").encode() + raw,
     "crlf.nrrd": (nrrd + "encoding: raw\n\n").replace("\n", "\r\n").encode() + raw,
     "element-size.mha": (mha + "ElementSize = 0.5 0.75 1.5\nElementDataFile = LOCAL\n").encode() + raw,
+    "unit.mha": (mha + "DistanceUnits = ?\nElementSpacing = 0.5 0.75 1.5\nElementDataFile = LOCAL\n").encode() + raw,
     "header.mha": (mha + "HeaderSize = -1\nElementSpacing = 0.5 0.75 1.5\nElementDataFile = LOCAL\n").encode() + b"anything" + raw,
 }
 for name, data in known.items():
@@ -179,7 +180,7 @@ for name, data in refused.items():
 fn header_fields_that_move_the_data_are_read_or_refused() {
     let directory = tempfile::tempdir().unwrap();
     let seen = run(PLACES, directory.path());
-    assert_eq!(seen.lines().count(), 17);
+    assert_eq!(seen.lines().count(), 18);
     for line in seen.lines() {
         let (name, numbers) = line.split_once(' ').unwrap_or((line, ""));
         let read = volume_files::read(&directory.path().join(name), &VolumeHints::default());

@@ -2,9 +2,8 @@
 
 use crate::error::{Error, Result};
 use crate::files;
-use crate::nrrd::length_mm;
 use crate::raw::{self, ByteOrder, Element};
-use crate::volume::{MAX_BYTES, Volume, VolumeHeader, affine, numbers};
+use crate::volume::{MAX_BYTES, Volume, VolumeHeader, affine, length_mm, numbers};
 use glam::DVec3;
 use std::path::Path;
 
@@ -68,10 +67,9 @@ pub fn read(path: &Path) -> Result<Volume> {
         Some(text) => numbers(path, "ElementSpacing", &text)?,
         None => return Err(bad("ElementSpacing", "is missing".into())),
     };
-    let unit = field("DistanceUnits").unwrap_or_else(|| "mm".into());
-    let unit_mm = length_mm(&unit).ok_or_else(|| {
-        bad("DistanceUnits", format!("`{unit}` is no unit of length that is known: m, cm, mm and um are"))
-    })?;
+    // MetaIO writes `?` for a unit that is not known.
+    let unit = field("DistanceUnits").filter(|unit| unit != "?");
+    let unit_mm = unit.map_or(Ok(1.0), |unit| length_mm(path, "DistanceUnits", &unit))?;
     let rotation = match field("TransformMatrix").or_else(|| field("Rotation")).or_else(|| field("Orientation")) {
         Some(text) => numbers(path, "TransformMatrix", &text)?,
         None => vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
@@ -94,16 +92,20 @@ pub fn read(path: &Path) -> Result<Volume> {
 /// Refuses fields that change the meaning of the values in a way that is not read. Other fields, and those that a program adds, say nothing
 /// about the place or the value of a voxel: ITK passes over them, too.
 fn refuse_what_is_not_read(path: &Path, field: impl Fn(&str) -> Option<String>) -> Result<()> {
-    let expected: [(&str, &[&str]); 4] = [
-        ("BinaryData", &["true"]),
-        ("ElementNumberOfChannels", &["1"]),
-        ("ElementToIntensityFunctionSlope", &["1", "1.0"]),
-        ("ElementToIntensityFunctionOffset", &["0", "0.0"]),
+    let refused = |name: &str, stated: &str, read: &str| {
+        Err(Error::data(path, name, format!("`{stated}` is not supported; {read} is")))
+    };
+    if let Some(stated) = field("BinaryData").filter(|stated| !stated.eq_ignore_ascii_case("true")) {
+        return refused("BinaryData", &stated, "True");
+    }
+    let numbers = [
+        ("ElementNumberOfChannels", 1.0),
+        ("ElementToIntensityFunctionSlope", 1.0),
+        ("ElementToIntensityFunctionOffset", 0.0),
     ];
-    for (name, accepted) in expected {
-        if let Some(stated) = field(name).filter(|stated| !accepted.contains(&&*stated.to_lowercase())) {
-            let problem = format!("`{stated}` is not supported; {} is", accepted[0]);
-            return Err(Error::data(path, name, problem));
+    for (name, read) in numbers {
+        if let Some(stated) = field(name).filter(|stated| stated.parse() != Ok(read)) {
+            return refused(name, &stated, &read.to_string());
         }
     }
     Ok(())

@@ -3,7 +3,7 @@
 use crate::error::{Error, Result};
 use crate::files;
 use crate::raw::{self, ByteOrder, Element};
-use crate::volume::{MAX_BYTES, Volume, VolumeHeader, affine, numbers};
+use crate::volume::{MAX_BYTES, Volume, VolumeHeader, affine, length_mm, numbers};
 use glam::{DAffine3, DMat3, DVec3};
 use std::io::Write;
 use std::path::Path;
@@ -261,14 +261,11 @@ impl Fields<'_> {
     fn units_mm(&self) -> Result<DVec3> {
         let Some(text) = self.get("space units") else { return Ok(DVec3::ONE) };
         let units: Vec<&str> = text.split(['"', ' ']).filter(|unit| !unit.is_empty()).collect();
-        let mm = |unit: &&str| {
-            length_mm(unit).ok_or_else(|| {
-                let problem = format!("`{unit}` is no unit of length that is known: m, cm, mm and um are");
-                Error::data(self.path, "space units", problem)
-            })
-        };
+        let mm = |unit: &&str| length_mm(self.path, "space units", unit);
         match units.iter().map(mm).collect::<Result<Vec<f64>>>()?[..] {
             [x, y, z] => Ok(DVec3::new(x, y, z)),
+            // Empty texts state no unit.
+            [] => Ok(DVec3::ONE),
             _ => Err(Error::data(self.path, "space units", format!("`{text}` does not have three units"))),
         }
     }
@@ -319,17 +316,6 @@ fn is_among(name: &str, fields: &[&str]) -> bool {
 fn words_outside(text: &str) -> Vec<&str> {
     let (before, vector) = text.split_at(text.find('(').unwrap_or(text.len()));
     before.split_whitespace().chain(Some(vector.trim()).filter(|vector| !vector.is_empty())).collect()
-}
-
-/// Length of a unit, mm.
-pub(super) fn length_mm(unit: &str) -> Option<f64> {
-    match unit {
-        "m" | "meter" | "metre" => Some(1e3),
-        "cm" => Some(10.0),
-        "mm" | "millimeter" | "millimetre" => Some(1.0),
-        "um" | "\u{b5}m" | "\u{3bc}m" | "micron" | "micrometer" => Some(1e-3),
-        _ => None,
-    }
 }
 
 /// Reads a 3D volume.

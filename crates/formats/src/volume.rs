@@ -174,6 +174,20 @@ pub(super) fn numbers(path: &Path, field: &str, text: &str) -> Result<Vec<f64>> 
         .collect()
 }
 
+/// Returns the length of a unit that a header names, mm.
+pub(super) fn length_mm(path: &Path, field: &str, unit: &str) -> Result<f64> {
+    match unit {
+        "m" | "meter" | "metre" => Ok(1e3),
+        "cm" => Ok(10.0),
+        "mm" | "millimeter" | "millimetre" => Ok(1.0),
+        "um" | "\u{b5}m" | "\u{3bc}m" | "micron" | "micrometer" => Ok(1e-3),
+        _ => {
+            let problem = format!("`{unit}` is no unit of length that is known: m, cm, mm and um are");
+            Err(Error::data(path, field, problem))
+        }
+    }
+}
+
 /// Transform from voxel index to LPS mm, from the columns and the origin in a header whose axes differ from LPS only by signs.
 pub(super) fn affine(path: &Path, field: &str, columns: &[f64], origin: &[f64], flip: DVec3) -> Result<DAffine3> {
     let (Ok(c), Ok(o)) = (<[f64; 9]>::try_from(columns), <[f64; 3]>::try_from(origin)) else {

@@ -11,7 +11,8 @@ use std::ops::Range;
 
 /// Rotation of a detector about its normal, degrees, that is taken for none: the accuracy of stated angles.
 const NO_TURN_DEG: f64 = 0.5;
-/// Primary angle, degrees, up to which the columns of an image run towards the patient's left.
+/// Primary angle, degrees, up to which the columns of an image run towards the patient's left: they have half of their
+/// length in this direction there, its cosine.
 const FROM_THE_FRONT_DEG: f64 = 60.0;
 /// Distance of the field of view from the middle of the detector, mm, that is not worth a warning: a few pixels.
 const MIDDLE_MM: f64 = 1.0;

@@ -109,7 +109,7 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     if let Some(file) = &args.export_hull {
         return export_hull(&config, &dataset, file);
     }
-    if run.join(MANIFEST).exists() {
+    if run.join(MANIFEST).exists() || run.canonicalize().ok() == data.canonicalize().ok() {
         let problem = "is the directory of a dataset; a run has a directory of its own";
         return Err(Error::config("--out", run.display(), problem));
     }
