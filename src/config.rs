@@ -25,7 +25,7 @@ mod x_gaussian;
 pub use choices::{AdjustMode, Decay, DynamicTarget, OcclusionRegion, R2Integral, R2Start, StaticData};
 pub use configuration::Config;
 pub(crate) use configuration::Shared;
-pub use dynamic_gaussians::GaussianForm;
+pub use dynamic_gaussians::{CatheterChoice, GaussianForm};
 pub use method::OfMethod;
 use method::methods;
 use sections::{GaussiansSettings, NerfCaSettings, NertCaSettings, R2Settings, SaxSettings, XSettings};

@@ -10,7 +10,7 @@ use crate::config::method::MethodSettings;
 use crate::config::section::{section, sections};
 use crate::config::{Config, Preset, Shared};
 use crate::error::Result;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use strum::{IntoStaticStr, VariantArray};
 
 /// Decay of Adam's first and second moments for the static field: the betas of NerT-CA's authors, whose static field it is.
@@ -34,6 +34,35 @@ pub enum GaussianForm {
     Deformable,
     /// `Deformable` where the data allow it, otherwise `Phase`.
     Auto,
+}
+
+/// Treatment of a catheter that a fit of the preset `fast` finds in the dynamic field.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
+pub enum CatheterChoice {
+    /// It stays in field, tree and scores: the choice of runs without this setting.
+    #[default]
+    Keep,
+    /// It is left out.
+    LeaveOut,
+    /// `LeaveOut` where at least two views show that it continues to the border of their images, otherwise `Keep`.
+    Auto,
+}
+
+/// Reads the treatment of a catheter; in older files it is whether one is left out.
+fn catheter_choice<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<CatheterChoice, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged, expecting = "expected keep, leave-out or auto")]
+    enum Stated {
+        IsLeftOut(bool),
+        Choice(CatheterChoice),
+    }
+    Ok(match Stated::deserialize(from)? {
+        Stated::IsLeftOut(true) => CatheterChoice::LeaveOut,
+        Stated::IsLeftOut(false) => CatheterChoice::Keep,
+        Stated::Choice(choice) => choice,
+    })
 }
 
 /// A special case of a fit of Gaussians, which a study can leave out to measure what it earns (`studies/rules.toml`).
@@ -115,8 +144,8 @@ section! {
         /// Number of fits with different seeds whose mean is the dynamic field; 0 = three where images are noisy, views were adjusted, or
         /// blades hide much of three views, five with two views, else one; 1 is the default for older files without this setting.
         #[serde(default = "one_fit")] fits: u32 in 0.0 to 9.0,
-        /// Leave out a catheter: Gaussians of a deformable set whose motion ends along a line.
-        #[serde(default)] without_catheter: bool,
+        /// Treatment of a catheter: Gaussians of a deformable set whose motion ends along a line.
+        #[serde(default, alias = "without_catheter", deserialize_with = "catheter_choice")] catheter: CatheterChoice,
         /// Rules that are left out, for studies of what each earns, e.g. `["fillings"]`.
         #[serde(default)] without_rules: LeftOut,
     } fixed {
@@ -199,7 +228,7 @@ pub(super) fn fast() -> Config<GaussiansSettings> {
                 iterations: 120,
                 count: 500,
                 fits: 0,
-                without_catheter: false,
+                catheter: CatheterChoice::Auto,
                 without_rules: LeftOut::default(),
                 grow_at: 50,
                 clear_at: 65,

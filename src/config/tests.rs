@@ -3,7 +3,7 @@
 use crate::calibrate::settings::CalibrateMode;
 use crate::choice::Choice;
 use crate::config::sections::{GaussiansSettings, NertCaSettings, R2Settings, Rule, XSettings};
-use crate::config::{AdjustMode, Config, GaussianForm, Preset};
+use crate::config::{AdjustMode, CatheterChoice, Config, GaussianForm, Preset};
 use crate::error::Result;
 use std::collections::BTreeSet;
 
@@ -234,7 +234,7 @@ fn whole_configurations_of_earlier_versions_are_read() {
     assert_eq!((fast.gaussians.count, fast.deformable.warm_iterations), (321, 59));
     assert_eq!((fast.adjustment.adjust, fast.calibrate.mode), (AdjustMode::Auto, CalibrateMode::Auto));
     let same = read(&[]).unwrap();
-    assert_eq!(same, Config::preset(Preset::Fast));
+    assert_eq!(same, load(Preset::Fast, "gaussians.catheter=keep").unwrap());
     let of_paper = [
         "[] preset = \"paper\"",
         "[gaussians] form = \"none\"",
@@ -291,7 +291,19 @@ fn sections_and_values_that_older_checkpoints_lack_have_their_defaults() {
         assert!(fast["gaussians"].as_table_mut().unwrap().remove(key).is_some());
     }
     let fast = fast.try_into::<Config>().unwrap().of::<GaussiansSettings>().unwrap();
-    assert_eq!((fast.gaussians.fits, fast.gaussians.without_catheter), (1, false));
+    assert_eq!((fast.gaussians.fits, fast.gaussians.catheter), (1, CatheterChoice::Keep));
+}
+
+#[test]
+fn the_treatment_of_a_catheter_is_chosen() {
+    let choice =
+        |setting: &str| load(Preset::Fast, setting).unwrap().of::<GaussiansSettings>().unwrap().gaussians.catheter;
+    assert_eq!(choice("gaussians.iterations=120"), CatheterChoice::Auto);
+    assert_eq!(choice("gaussians.catheter=leave-out"), CatheterChoice::LeaveOut);
+    let earlier = old(&["[gaussians] without_catheter = true"]).try_into::<Config>().unwrap();
+    assert_eq!(earlier.of::<GaussiansSettings>().unwrap().gaussians.catheter, CatheterChoice::LeaveOut);
+    let message = refusal(Preset::Fast, "gaussians.catheter=gone");
+    assert!(message.contains("keep, leave-out or auto"), "{message}");
 }
 
 #[test]

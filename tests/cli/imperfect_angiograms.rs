@@ -68,26 +68,26 @@ fn imperfect_angiograms_cost_little() {
 /// A catheter that all training views show, and no unseen view: Dice is .84 with it and .95 without it.
 #[test]
 #[ignore = "long: tools/test --all"]
-fn a_catheter_is_left_out_on_request() {
+fn a_catheter_is_left_out_where_views_show_where_it_enters() {
     let Some(anatomy) = shared::shared("anatomy") else { return };
     let tree = anatomy.join("coronary_tree_hra.json");
     let directory = tempfile::tempdir().unwrap();
     let data = directory.path().join("data");
     nertca(&["phantom", text(&data), "--tree", text(&tree), "--catheter", "--seed", "1", "--no-volumes"]);
-    let trained = |without: bool| {
-        let run = directory.path().join(without.to_string());
-        let setting = format!("gaussians.without_catheter={without}");
+    let trained = |choice: &str| {
+        let run = directory.path().join(choice);
+        let setting = format!("gaussians.catheter={choice}");
         let args = ["train", text(&data), "-o", text(&run), "--seed", "1", "--stop-at", "130", "--set", &setting];
         let out = program().args(args).output().unwrap();
         let said = String::from_utf8_lossy(&out.stderr).into_owned();
         assert!(out.status.success(), "{said}");
         (read(&run.join("report/evaluation.json"))["dice"]["dynamic"].as_f64().unwrap(), said)
     };
-    let [(with, found), (without, left_out)] = [false, true].map(trained);
+    let [(with, found), (without, left_out)] = ["keep", "auto"].map(trained);
     println!("with the catheter: Dice {with:.3}, without: {without:.3}");
     assert!(found.contains("a catheter seems to be in the dynamic field"), "{found}");
-    assert!(found.contains("--set gaussians.without_catheter=true leaves it out"), "{found}");
-    assert!(left_out.contains("it is left out (gaussians.without_catheter)"), "{left_out}");
+    assert!(found.contains("--set gaussians.catheter=leave-out leaves it out"), "{found}");
+    assert!(left_out.contains("it is left out: --set gaussians.catheter=keep"), "{left_out}");
     assert!(with < 0.88 && without > 0.93, "with the catheter {with}, without {without}");
 }
 

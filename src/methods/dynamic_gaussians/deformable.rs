@@ -24,7 +24,6 @@ use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup, GaussianView, MotionGridSetup};
-use crate::methods::dynamic_gaussians::deformable::catheter::Catheter;
 use crate::methods::dynamic_gaussians::deformable::filling::{Filling, FillingBuffers, from_set_of_phase};
 use crate::methods::dynamic_gaussians::deformable::members::{MemberBuffers, Members};
 use crate::methods::dynamic_gaussians::deformable::stages::{
@@ -72,8 +71,8 @@ pub struct DeformableTrainer {
     step: u32,
     /// Whether a catheter is looked for at the end.
     finds_catheter: bool,
-    /// Catheter that was found at the end.
-    catheter: Option<Catheter>,
+    /// Sentence on the catheter that was found at the end.
+    finding: Option<String>,
 }
 
 /// Setup, schedule and buffers of iterations of one kind: the joint fit of everything, or the tracking of a phase.
@@ -175,7 +174,7 @@ impl DeformableTrainer {
             iterations,
             step: 0,
             finds_catheter: true,
-            catheter: None,
+            finding: None,
         })
     }
 

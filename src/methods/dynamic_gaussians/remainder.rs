@@ -99,7 +99,7 @@ fn left(targets: &Targets, images: &[f32], image: usize) -> Image {
 }
 
 /// Returns the median of each pixel over the images.
-fn level(left: &[Image]) -> Vec<f32> {
+pub(super) fn level(left: &[Image]) -> Vec<f32> {
     let (n, m) = (left[0].values.len(), left.len());
     let of = |p: usize| {
         let mut values: Vec<f32> = left.iter().map(|image| image.values[p]).collect();

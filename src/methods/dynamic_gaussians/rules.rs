@@ -8,7 +8,7 @@
 //! [`Lengths`]: crate::methods::dynamic_gaussians::targets::lengths::Lengths
 
 use crate::config::sections::{GaussiansSettings, LeftOut, Train};
-use crate::config::{Config, GaussianForm};
+use crate::config::{CatheterChoice, Config, GaussianForm};
 
 /// Adam's rate of natural log-scales, per iteration.
 pub const SCALE_RATE: f64 = 0.03;
@@ -44,8 +44,8 @@ pub struct Rules {
     pub form: GaussianForm,
     /// Number of fits whose mean is the dynamic field; 0 = as many as the data ask for.
     pub fits: u32,
-    /// Leave out a catheter.
-    pub without_catheter: bool,
+    /// Treatment of a catheter.
+    pub catheter: CatheterChoice,
     /// A set of Gaussians.
     pub gaussians: GaussianRules,
     /// One set that moves.
@@ -118,7 +118,7 @@ impl Rules {
             train: config.train.clone(),
             form: gaussians.form,
             fits: gaussians.fits,
-            without_catheter: gaussians.without_catheter,
+            catheter: gaussians.catheter,
             gaussians: GaussianRules {
                 iterations: gaussians.iterations,
                 count: gaussians.count,

@@ -5,7 +5,11 @@
 use crate::gaussians::field::{MovingGaussians, mass};
 use crate::geometry::MM_PER_UNIT;
 use crate::methods::dynamic_gaussians::deformable::linked::{extent, groups, grown};
+use crate::methods::dynamic_gaussians::remainder::level;
+use crate::methods::dynamic_gaussians::targets::Targets;
+use crate::raster::{Image, opening};
 use glam::DVec3;
+use std::collections::BinaryHeap;
 
 // Numbers of this file without another source: chosen on one anatomy (docs/methods/gaussians.md, Schedule).
 /// Motion, as a share of that of the median Gaussian, below which a Gaussian is slow.
@@ -29,6 +33,11 @@ const LINK: f64 = 6.0;
 /// Distance within which other Gaussians are neighbours of a catheter, pixels of the settings.
 const NEXT: f64 = 4.0;
 
+/// Width up to which a structure is taken for a catheter, mm: twice that of the widest one for coronary arteries, 8 French.
+const MAX_WIDTH_MM: f64 = 5.4;
+/// Contrast that a catheter has at least on its way to the border, as a share of its contrast at the end that rests.
+const CONTRAST_ON_THE_WAY: f32 = 0.5;
+
 /// Catheter in a deformable set.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Catheter {
@@ -38,6 +47,8 @@ pub struct Catheter {
     pub extent_mm: f64,
     /// Motion of its slowest Gaussian, as a share of the motion of the median Gaussian.
     pub slowest: f64,
+    /// Index of its slowest Gaussian, where what can be seen of its motion ends.
+    pub slowest_member: usize,
 }
 
 impl Catheter {
@@ -52,7 +63,8 @@ impl Catheter {
         };
         let parts = groups(slow, points.near(LINK * factor));
         let part = parts.into_iter().filter(is_catheter).max_by_key(Vec::len)?;
-        let slowest = part.iter().map(|i| points.motion[*i]).fold(f64::INFINITY, f64::min);
+        let slowest_member = part.iter().copied().min_by(|a, b| points.motion[*a].total_cmp(&points.motion[*b]))?;
+        let slowest = points.motion[slowest_member];
         let part = points.with_neighbours(part, NEXT * factor);
         if part.len() as f64 > MAX_SHARE * points.places.len() as f64 {
             return None;
@@ -60,7 +72,95 @@ impl Catheter {
         let mut members = vec![false; points.places.len()];
         part.iter().for_each(|i| members[*i] = true);
         let extent_mm = points.extent(&part) * set.rest.units.pixel * MM_PER_UNIT;
-        Some(Catheter { members, extent_mm, slowest })
+        Some(Catheter { members, extent_mm, slowest, slowest_member })
+    }
+
+    /// Returns a sentence on a catheter that `n_entered` views show up to the border of their images.
+    pub fn sentence(&self, n_entered: usize, is_left_out: bool) -> String {
+        let seen = format!(
+            "a catheter seems to be in the dynamic field: {:.0} mm whose motion falls to {:.0} % of that of the vessels; \
+             views that show it up to the border of their images: {n_entered}",
+            self.extent_mm,
+            100.0 * self.slowest
+        );
+        match is_left_out {
+            true => format!("{seen}; it is left out: --set gaussians.catheter=keep keeps it"),
+            false => format!("{seen}; --set gaussians.catheter=leave-out leaves it out of field, tree and scores"),
+        }
+    }
+}
+
+/// Counts the views whose median image shows that a catheter goes on from its `slowest` Gaussian to the border of the image or
+/// of what is hidden: a thin dark line, as no vessel leaves the image at the end that rests.
+pub(super) fn views_entered(targets: &Targets, field: &MovingGaussians, slowest: usize) -> usize {
+    let at = field.position(slowest, targets.rest_phase as f64);
+    let enters = |view: usize| {
+        let images: Vec<usize> =
+            targets.image_of.iter().skip(view).step_by(targets.n_views).flatten().copied().collect();
+        let Some(first) = images.first() else { return false };
+        let image = |image: &usize| Image {
+            width: targets.width,
+            height: targets.height,
+            values: targets.images[image * targets.n_pixels()..(image + 1) * targets.n_pixels()].to_vec(),
+        };
+        let values = level(&images.iter().map(image).collect::<Vec<_>>());
+        let median = Image { width: targets.width, height: targets.height, values };
+        let (_, column, row) = targets.views[*first].project(at);
+        let radius = (MAX_WIDTH_MM / (2.0 * targets.units.pixel * MM_PER_UNIT)).ceil() as usize;
+        let contrast = contrast_of_the_way(&median, targets.weight.image(*first), [column, row], radius);
+        contrast.is_some_and(|[end, way]| way >= CONTRAST_ON_THE_WAY * end)
+    };
+    (0..targets.n_views).filter(|view| enters(*view)).count()
+}
+
+/// Follows structures up to `2 radius` wide from a place (column, row) to the border of an image or of pixels of `weight` 0.
+/// Returns their contrast at the place and the lowest one on the way, which is the way whose lowest contrast is the highest;
+/// none where the place lies outside of the image.
+fn contrast_of_the_way(image: &Image, weight: &[f32], [column, row]: [f64; 2], radius: usize) -> Option<[f32; 2]> {
+    let (width, height) = (image.width, image.height);
+    let wide = opening(image, radius);
+    let contrast: Vec<f32> = image.values.iter().zip(&wide.values).map(|(value, wide)| value - wide).collect();
+    let is_inside = |x: f64, n: usize| x >= 0.0 && x < n as f64;
+    if !is_inside(column, width) || !is_inside(row, height) {
+        return None;
+    }
+    let near = |x: f64, n: usize| (x as usize).saturating_sub(radius)..=(x as usize + radius).min(n - 1);
+    let around = near(row, height).flat_map(|y| near(column, width).map(move |x| y * width + x));
+    let start = around.max_by(|a, b| contrast[*a].total_cmp(&contrast[*b]))?;
+    let mut seen = vec![false; contrast.len()];
+    let mut open = BinaryHeap::from([(Contrast(contrast[start]), start)]);
+    let mut lowest = contrast[start];
+    while let Some((Contrast(here), pixel)) = open.pop() {
+        if std::mem::replace(&mut seen[pixel], true) {
+            continue;
+        }
+        lowest = lowest.min(here);
+        let (x, y) = (pixel % width, pixel / width);
+        if weight[pixel] == 0.0 || x == 0 || y == 0 || x + 1 == width || y + 1 == height {
+            return Some([contrast[start], lowest]);
+        }
+        for next in [pixel - 1, pixel + 1, pixel - width, pixel + width] {
+            open.push((Contrast(contrast[next]), next));
+        }
+    }
+    None
+}
+
+/// Contrast by which pixels are put in order.
+#[derive(Clone, Copy, PartialEq)]
+struct Contrast(f32);
+
+impl Eq for Contrast {}
+
+impl Ord for Contrast {
+    fn cmp(&self, other: &Contrast) -> std::cmp::Ordering {
+        self.0.total_cmp(&other.0)
+    }
+}
+
+impl PartialOrd for Contrast {
+    fn partial_cmp(&self, other: &Contrast) -> Option<std::cmp::Ordering> {
+        Some(self.cmp(other))
     }
 }
 
@@ -180,6 +280,29 @@ mod tests {
         let mut field = set(|along| 2.0 + 2.0 * along, &line(|along| 2.0 * (1.0 - along).powi(3)));
         field.rest.rows[VESSEL..].iter_mut().for_each(|g| g.log_density = 0.7f32.ln());
         assert_eq!(Catheter::find(&field, 1.0), None);
+    }
+
+    /// An image with a line along x, of contrast 1, from the middle to column `end`, on a background that changes slowly.
+    fn image_of_a_line(end: usize, gap: Option<usize>) -> Image {
+        let (width, height) = (40, 30);
+        let is_line = |x: usize, y: usize| (20..=end).contains(&x) && (14..=15).contains(&y) && Some(x) != gap;
+        let value = |p: usize| 0.02 * (p % width) as f32 + f32::from(u8::from(is_line(p % width, p / width)));
+        Image { width, height, values: (0..width * height).map(value).collect() }
+    }
+
+    #[test]
+    fn a_line_is_followed_to_the_border_or_to_a_blade() {
+        let share = |image: &Image, weight: &[f32]| {
+            let [end, way] = contrast_of_the_way(image, weight, [21.0, 14.5], 3).unwrap();
+            way / end
+        };
+        let [seen, mut blade] = [(); 2].map(|()| vec![1.0; 40 * 30]);
+        assert!(share(&image_of_a_line(39, None), &seen) > 0.9);
+        assert!(share(&image_of_a_line(34, None), &seen) < 0.2, "a line that ends within the image");
+        assert!(share(&image_of_a_line(39, Some(30)), &seen) < 0.2, "a line with a gap");
+        (0..30).for_each(|y| blade[y * 40 + 33] = 0.0);
+        assert!(share(&image_of_a_line(34, None), &blade) > 0.9);
+        assert_eq!(contrast_of_the_way(&image_of_a_line(39, None), &seen, [41.0, 3.0], 3), None);
     }
 
     #[test]

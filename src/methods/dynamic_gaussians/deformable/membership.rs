@@ -1,9 +1,10 @@
 //! Changes of the members of a deformable set: Gaussians that are dropped, and new ones where line integrals are missing.
 
+use crate::config::CatheterChoice;
 use crate::error::Result;
 use crate::gaussians::field::dense;
 use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
-use crate::methods::dynamic_gaussians::deformable::catheter::Catheter;
+use crate::methods::dynamic_gaussians::deformable::catheter::{Catheter, views_entered};
 use crate::methods::dynamic_gaussians::groups::vessels;
 use crate::methods::dynamic_gaussians::per_phase::strong;
 use crate::methods::dynamic_gaussians::rules::FAINT;
@@ -12,6 +13,8 @@ use glam::DVec3;
 
 /// Minimum filling at the phases whose images decide where new Gaussians are placed.
 const MOSTLY_FILLED: f64 = 0.5;
+/// Views in which a catheter must come from the border of the image: one alone may show an edge of a bone there.
+const MIN_VIEWS_ENTERED: usize = 2;
 
 impl DeformableTrainer {
     /// Drops weak Gaussians and places new ones where data are missing at half the phases. This happens once in a run, on the
@@ -47,26 +50,25 @@ impl DeformableTrainer {
         self.retain(|rows| vessels(rows, &setup, link)).map(|_| ())
     }
 
-    /// Looks for a catheter, and drops it where the settings say so.
+    /// Looks for a catheter, and drops it where the settings, or the images of the views, say so.
     pub(super) fn find_catheter(&mut self) -> Result<()> {
-        self.catheter = Catheter::find(&self.deformable()?, self.targets.lengths.factor);
-        let dropped = self.catheter.as_ref().filter(|_| self.config.without_catheter);
-        if let Some(keep) = dropped.map(|catheter| catheter.members.iter().map(|member| !member).collect()) {
-            self.retain(|_| keep)?;
+        let field = self.deformable()?;
+        let Some(catheter) = Catheter::find(&field, self.targets.lengths.factor) else { return Ok(()) };
+        let n_entered = views_entered(&self.targets, &field, catheter.slowest_member);
+        let is_left_out = match self.config.catheter {
+            CatheterChoice::Keep => false,
+            CatheterChoice::LeaveOut => true,
+            CatheterChoice::Auto => n_entered >= MIN_VIEWS_ENTERED,
+        };
+        if is_left_out {
+            self.retain(|_| catheter.members.iter().map(|member| !member).collect())?;
         }
+        self.finding = Some(catheter.sentence(n_entered, is_left_out));
         Ok(())
     }
 
     /// Returns a sentence on the catheter that was found, once.
     pub(in crate::methods::dynamic_gaussians) fn take_finding(&mut self) -> Option<String> {
-        let Catheter { extent_mm, slowest, .. } = self.catheter.take()?;
-        let found = format!(
-            "a catheter seems to be in the dynamic field: {extent_mm:.0} mm whose motion falls to {:.0} % of that of the vessels",
-            100.0 * slowest
-        );
-        Some(match self.config.without_catheter {
-            true => format!("{found}; it is left out (gaussians.without_catheter)"),
-            false => format!("{found}; --set gaussians.without_catheter=true leaves it out of field, tree and scores"),
-        })
+        self.finding.take()
     }
 }
