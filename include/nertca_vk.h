@@ -1103,7 +1103,7 @@ nertca_status nertca_context_destroy(nertca_context *context);
  * (`true` for an object at rest, as in `dataset.json`: frames of phase 0 show it, and frames of phase 1 the same without vessels, which
  * are estimated for views that have none; frames with a time need no R-peaks; the result has one phase, 0), `depth_half_extent_mm`
  * (attenuation is searched within this distance of the isocentre plane; 100), `vessel_attenuation_per_mm` (attenuation of
- * filled vessels, where known: sets the Dice threshold), `preset` (fast, fast-mlp, paper, public-code, nerf-ca, r2-gaussian,
+ * filled vessels, where known: sets the Dice threshold), `preset` (fast, fast-mlp, paper, public-code, nert-ca, nerf-ca, r2-gaussian,
  * x-gaussian or sax-nerf) and every key that `nertca-vk train --print-config` shows, as in `train.iterations = 800`.
  *
  * `*reconstruction` is null on failure. Callable from any thread.

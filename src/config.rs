@@ -58,6 +58,8 @@ pub enum Preset {
     Paper,
     /// The method as the authors' public code implements it.
     PublicCode,
+    /// The method as the authors' public code implements it, with a box and a network rate at which vessels appear on other data.
+    NertCa,
     /// NeRF-CA, a baseline of the paper, as its public code implements it: both fields are networks.
     NerfCa,
     /// R2-Gaussian, a static baseline of the paper: Gaussians alone, fitted to each phase separately.
@@ -83,6 +85,7 @@ impl Config {
             Preset::FastMlp => nert_ca::fast_mlp().into_any(),
             Preset::Paper => nert_ca::paper().into_any(),
             Preset::PublicCode => nert_ca::public_code().into_any(),
+            Preset::NertCa => nert_ca::nert_ca().into_any(),
             Preset::NerfCa => nerf_ca::nerf_ca().into_any(),
             Preset::R2Gaussian => r2_gaussian::r2_gaussian().into_any(),
             Preset::XGaussian => x_gaussian::x_gaussian().into_any(),

@@ -132,7 +132,7 @@ class Reconstruction:
     phases: cardiac phases; for an object at rest, 1, or 2 where frames of phase 1 show it without vessels.
     still: whether the object is at rest, as in `dataset.json`: its vessels are seen by what stands out of each view, not by motion, and
         the result has one phase, 0.
-    preset: "fast", "fast-mlp", "paper", "public-code", "nerf-ca", "r2-gaussian", "x-gaussian" or "sax-nerf".
+    preset: "fast", "fast-mlp", "paper", "public-code", "nert-ca", "nerf-ca", "r2-gaussian", "x-gaussian" or "sax-nerf".
     depth_half_extent_mm: attenuation is searched within this distance of the isocentre plane; 100 when None.
     vessel_attenuation_per_mm: of filled vessels, where known: sets the Dice threshold.
     settings: every key that `nertca-vk train --print-config` shows, as in `{"train.iterations": 800}`.

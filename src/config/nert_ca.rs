@@ -1,4 +1,4 @@
-//! Settings of NerT-CA: the presets `paper`, `public-code` and `fast-mlp`.
+//! Settings of NerT-CA: the presets `paper`, `public-code`, `nert-ca` and `fast-mlp`.
 
 use crate::calibrate::settings::CalibrateMode;
 use crate::config::choices::{Decay, DynamicTarget, OcclusionRegion};
@@ -158,6 +158,21 @@ pub(super) fn public_code() -> Config<NertCaSettings> {
     let network = &mut method.network;
     (network.layers, network.skip_layer, network.decay) = (5, 4, Decay::Exponential);
     method.dynamic.occlusion_region = OcclusionRegion::LastRay;
+    config
+}
+
+/// Applies what the public code needs to find vessels on data of other sizes (docs/methods/nert-ca.md, Presets): boxes as large as what
+/// the views see, samples that lie within them, and half of the network's rate. Nothing near a source lies in such a box, so that
+/// occlusion minimisation has nothing to do.
+pub(super) fn nert_ca() -> Config<NertCaSettings> {
+    let mut config = public_code();
+    config.preset = Preset::NertCa;
+    let method = &mut config.method;
+    method.march =
+        March { dynamic_samples: 96, fit_dynamic_range: true, fit_static_range: true, ..method.march.clone() };
+    method.static_field.half_extent_mm = 0.0;
+    (method.network.lr, method.network.lr_end) = (5e-2, 5e-3);
+    (method.dynamic.half_extent_mm, method.dynamic.occlusion) = (0.0, 0.0);
     config
 }
 

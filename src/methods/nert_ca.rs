@@ -12,8 +12,9 @@ use crate::fields::data::{FieldData, RayLists, heart_shifts_ignored};
 use crate::fields::motion::{self, Thresholds, ViewMotion};
 use crate::fields::scale::dynamic_half;
 use crate::fields::state;
-use crate::fitting::extent::between_phases;
+use crate::fitting::extent::{between_phases, seen_half};
 use crate::fitting::fit::{Abilities, Method, PlannedFit, SavedAt, SavedFit};
+use crate::geometry::MM_PER_UNIT;
 use crate::model::hull::Hull;
 use crate::model::scene::Scene;
 use crate::scan::dataset::Dataset;
@@ -32,17 +33,34 @@ pub static METHOD: Method = Method {
     abilities: Abilities::NONE,
 };
 
+/// Half side of the dynamic field's box, in units of what the views see, from which its vessels do not appear in unseen views
+/// (studies/README.md: .8 works, 2 does not).
+const WIDE: f64 = 1.5;
+
 /// Prepares a fit.
 fn plan(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
     notes.extend(heart_shifts_ignored(dataset));
     notes.extend(between_phases(dataset, "are trained at their own time"));
     let (config, settings) = (config.of::<NertCaSettings>()?, settings_of(config)?);
+    notes.extend(wide_box(config.dynamic.half_extent_mm, dataset));
     let NertCaHull { min_share, min_share_few_views, dilate_pixels, .. } = config.hull;
     let motion = motion::analyse(dataset, Thresholds { min_share, min_share_few_views, dilate_pixels });
     let hull = choose_hull(&config.hull, dynamic_half(config.dynamic.half_extent_mm, dataset), dataset, &motion, notes);
     let scene = Scene::new(&settings, dataset, &motion, hull.as_ref())?;
     let lists = RayLists::of_hull(dataset, &motion, hull.as_ref());
     Ok(FieldData::new(&settings, dataset, &motion, hull, scene, lists)?.into())
+}
+
+/// Returns a warning where the box of the dynamic field, `half_extent_mm` each way, is much wider than what the views see.
+fn wide_box(half_extent_mm: f64, dataset: &Dataset) -> Option<String> {
+    let seen_mm = seen_half(dataset) * MM_PER_UNIT;
+    (half_extent_mm > WIDE * seen_mm).then(|| {
+        format!(
+            "warning: the box of the dynamic field reaches {half_extent_mm} mm each way, but the views see {seen_mm:.0} mm together; in \
+             a box so wide the network explains each view by itself and no vessels appear in others. The preset nert-ca is this \
+             method with a box of what the views see"
+        )
+    })
 }
 
 /// Reads the fields and the state of their fit from a checkpoint.

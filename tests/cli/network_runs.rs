@@ -1,4 +1,4 @@
-//! Runs with two networks (the preset `nerf-ca`), through the program.
+//! Runs with networks (the presets of NeRF-CA and NerT-CA), through the program.
 
 use crate::program::program;
 use serde_json::Value;
@@ -67,4 +67,36 @@ fn the_program_trains_resumes_scores_draws_exports_and_times_them() {
         ok(&[&["bench", text(&data), "--warm-up", "0", "--iterations", "1", "--repeats", "1", "--kernels"], TINY]
             .concat());
     assert!(timed.contains("loss_samples") && timed.contains("network passes only"), "{timed}");
+}
+
+/// Warnings of NerT-CA's presets: the published box, and a dynamic field that vanishes at the delay, as normalised losses make it.
+#[test]
+fn runs_without_vessels_are_told_when_they_begin_and_when_the_field_vanishes() {
+    const SMALL: &[&str] = &[
+        "--set=train.rays=128",
+        "--set=train.iterations=60",
+        "--set=train.validate_every=40",
+        "--set=march.dynamic_samples=32",
+        "--set=march.static_samples=32",
+        "--set=dynamic.width=32",
+        "--set=dynamic.delay=20",
+        "--no-eval",
+    ];
+    let directory = tempfile::tempdir().unwrap();
+    let data = directory.path().join("data");
+    ok(&["phantom", text(&data), "--size", "32", "--phases", "4", "--views", "4", "--no-volumes"]);
+    let said = |name: &str, more: &[&str]| {
+        let run = directory.path().join(name);
+        let out = program().args(["train", text(&data), "-o", text(&run)]).args(SMALL).args(more).output().unwrap();
+        assert!(out.status.success(), "{out:?}");
+        String::from_utf8(out.stderr).unwrap()
+    };
+    let vanished = said("vanishes", &["--preset", "public-code", "--set", "loss.normalise=true"]);
+    let wide = "warning: the box of the dynamic field reaches 100 mm each way, but the views see 25 mm together";
+    assert!(vanished.contains(wide), "{vanished}");
+    let zero = "warning: after 40 iterations the dynamic field is zero everywhere";
+    assert_eq!(vanished.matches(zero).count(), 1, "{vanished}");
+    assert!(!vanished.contains("after 60 iterations the dynamic"), "it is told once: {vanished}");
+    let lives = said("lives", &["--preset", "nert-ca"]);
+    assert!(!lives.contains("warning: the box") && !lives.contains("is zero everywhere"), "{lives}");
 }

@@ -52,6 +52,23 @@ fn bar(template: &str) -> ProgressBar {
     bar
 }
 
+/// Strongest line integral of the dynamic field, as a share of that of both fields, below which it has vanished: a network begins with 1e-3
+/// and more, filled vessels have a tenth, and fields that had vanished had 1e-9 and less.
+const VANISHED: f64 = 1e-6;
+
+/// Returns a note on the data as a line; a warning stands for itself.
+fn noted(note: &str) -> String {
+    if note.starts_with("warning: ") { note.to_owned() } else { format!("- {note}") }
+}
+
+/// Returns a warning about a dynamic field that was zero after `step` iterations.
+fn of_vanished(step: u32) -> String {
+    format!(
+        "warning: after {step} iterations the dynamic field is zero everywhere, from where its network does not return: the result will \
+         have no vessels. End the run with Ctrl-C, and take a lower dynamic.lr or the preset nert-ca"
+    )
+}
+
 /// Returns an observer that shows a bar and lines on stderr.
 pub fn show_progress() -> impl FnMut(&Event) {
     let terminal = std::io::stderr().is_terminal();
@@ -60,12 +77,13 @@ pub fn show_progress() -> impl FnMut(&Event) {
         if terminal { bar.println(printable(&text)) } else { eprintln!("{text}") }
     };
     let mut evaluation = show_evaluation();
+    let mut has_vanished = false;
     move |event| match event {
         Event::Started { device, step, iterations, parameters, notes } => {
             bar.set_length(u64::from(*iterations));
             bar.set_position(u64::from(*step));
             say(&bar, format!("{device}: {parameters} parameters"));
-            notes.iter().for_each(|n| say(&bar, format!("- {n}")));
+            notes.iter().for_each(|note| say(&bar, noted(note)));
         }
         Event::Memory { host_mib, device_mib, together_mib } => say(
             &bar,
@@ -98,9 +116,13 @@ pub fn show_progress() -> impl FnMut(&Event) {
             say(&bar, format!("warning: {}", LargeLoss { step: *step, loss: *loss, ratio: *ratio }));
         }
         Event::Found { note, .. } => say(&bar, format!("- {note}")),
-        Event::Validation { step, train_s, dice_dynamic, psnr, ssim, .. } => {
+        Event::Validation { step, train_s, dice_dynamic, psnr, ssim, dynamic_integral, .. } => {
             let dice = dice_dynamic.map_or("-".into(), |d| format!("{d:.3}"));
             say(&bar, format!("{step:6} iterations, {train_s:6.1} s: Dice {dice}  PSNR {psnr:.2} dB  SSIM {ssim:.3}"));
+            if !has_vanished && dynamic_integral.is_some_and(|share| share < VANISHED) {
+                has_vanished = true;
+                say(&bar, of_vanished(*step));
+            }
         }
         Event::Evaluation { .. } => evaluation(event),
         Event::Profile { .. } => (),

@@ -42,7 +42,8 @@ pub(crate) fn pair(text: &str) -> Option<[f64; 2]> {
 #[derive(Debug, Args)]
 pub struct ConfigArgs {
     /// Set of defaults: `fast` (deformable set of Gaussians; normalised, tuned), `fast-mlp` (a dynamic network;
-    /// normalised, tuned), `paper` (as described in the paper), `public-code` (as in the authors' code), `nerf-ca` (two
+    /// normalised, tuned), `paper` (as described in the paper), `public-code` (as in the authors' code), `nert-ca` (the same
+    /// with what it needs on data of other sizes), `nerf-ca` (two
     /// networks; a method that the paper compares with), `r2-gaussian`, `x-gaussian` or `sax-nerf` (static methods that
     /// the paper compares with, fitted to each phase: Gaussians, Gaussians that occlude each other, or a hash grid with
     /// a network); `fast`, unless a configuration file names one.

@@ -102,6 +102,9 @@ pub enum Event {
         psnr: f64,
         /// Structural similarity.
         ssim: f64,
+        /// Strongest line integral of the dynamic field, as a share of that of both fields; none where it is no network, or has not begun.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        dynamic_integral: Option<f64>,
         /// Mean distance to the true vessels (Chamfer) at the end of systole, mm, where the dataset has its vessels as
         /// volumes.
         #[serde(skip_serializing_if = "Option::is_none")]

@@ -149,6 +149,7 @@ pub fn reconstruct(
         validation: eval::spread_validation(thin.as_ref().unwrap_or(dataset), VALIDATION_IMAGES),
         distance,
         begin,
+        network_begins: config.fields().filter(|fields| fields.network.is_some()).map(|fields| fields.dynamic.delay),
         cancel: options.cancel,
     };
     std::thread::scope(|scope| {

@@ -35,6 +35,8 @@ pub(super) struct SnapshotWorker<'a> {
     pub(super) validation: Vec<&'a Frame>,
     pub(super) distance: Option<Distance>,
     pub(super) begin: Instant,
+    /// Iterations after which a network is the dynamic field; none where it is none.
+    pub(super) network_begins: Option<u32>,
     /// Ends the current validation once it is true.
     pub(super) cancel: &'a AtomicBool,
 }
@@ -68,9 +70,13 @@ impl SnapshotWorker<'_> {
                 none => none.insert(Renderer::new(self.gpu, &saved.model, self.tuning.clone())?),
             };
             renderer.set_model(&saved.model)?;
-            let go_on = |_: Scoring<'_>| match self.cancel.load(Ordering::Relaxed) {
-                true => Err(Error::Interrupted),
-                false => Ok(()),
+            let (mut of_dynamic, mut of_both) = (0f32, 0f32);
+            let go_on = |scoring: Scoring<'_>| {
+                if let Scoring::Scored { rendering, .. } = scoring {
+                    of_dynamic = rendering.dynamic_integral.iter().fold(of_dynamic, |a, b| a.max(*b));
+                    of_both = rendering.total_integral().iter().fold(of_both, |a, b| a.max(*b));
+                }
+                if self.cancel.load(Ordering::Relaxed) { Err(Error::Interrupted) } else { Ok(()) }
             };
             let score = match evaluate(renderer, self.dataset, &self.validation, step, None, go_on) {
                 // The run is ending: the snapshot is saved but not scored.
@@ -89,6 +95,10 @@ impl SnapshotWorker<'_> {
                 dice_total: score.dice.total,
                 psnr: score.psnr,
                 ssim: score.ssim,
+                dynamic_integral: self
+                    .network_begins
+                    .filter(|begin| step > *begin && of_both > 0.0)
+                    .map(|_| f64::from(of_dynamic / of_both)),
                 chamfer_mm,
             });
         }
