@@ -161,18 +161,15 @@ pub(super) fn public_code() -> Config<NertCaSettings> {
     config
 }
 
-/// Applies what the public code needs to find vessels on data of other sizes (docs/methods/nert-ca.md, Presets): boxes as large as what
-/// the views see, samples that lie within them, and half of the network's rate. Nothing near a source lies in such a box, so that
-/// occlusion minimisation has nothing to do.
+/// Applies what the public code needs to find vessels on data of other sizes (docs/methods/nert-ca.md): boxes as large as what the views
+/// see, and half of the network's rate.
 pub(super) fn nert_ca() -> Config<NertCaSettings> {
     let mut config = public_code();
     config.preset = Preset::NertCa;
     let method = &mut config.method;
-    method.march =
-        March { dynamic_samples: 96, fit_dynamic_range: true, fit_static_range: true, ..method.march.clone() };
     method.static_field.half_extent_mm = 0.0;
     (method.network.lr, method.network.lr_end) = (5e-2, 5e-3);
-    (method.dynamic.half_extent_mm, method.dynamic.occlusion) = (0.0, 0.0);
+    method.dynamic.half_extent_mm = 0.0;
     config
 }
 

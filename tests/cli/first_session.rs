@@ -38,7 +38,14 @@ fn a_first_session_needs_no_manual() {
 #[cfg(unix)]
 fn errors_of_standard_output_fail_and_closed_pipes_do_not() {
     let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
-    for args in [&["info", "--schema"][..], &["completions", "bash"], &["train", "--print-config"]] {
+    for args in [
+        &["info", "--schema"][..],
+        &["completions", "bash"],
+        &["train", "--print-config"],
+        &["--help"],
+        &["next", "--help"],
+        &["--version"],
+    ] {
         let out = program().args(args).stdout(full.try_clone().unwrap()).output().unwrap();
         let stderr = String::from_utf8_lossy(&out.stderr);
         assert_eq!(out.status.code(), Some(1), "{args:?}: {stderr}");

@@ -49,6 +49,28 @@ fn data() -> &'static str {
     data
 }
 
+/// Calls of the short run to its device, with its scores: submits depend on the pace of the device, which is not looked at here. A call more
+/// costs microseconds on a CPU, and tens of them on a GPU.
+const MAX_RECORDINGS: u64 = 1_500;
+const MAX_BUFFERS: u64 = 2_100;
+
+#[test]
+fn a_run_records_the_times_of_its_stages_and_its_calls_to_the_device() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("run");
+    let args = [&["train", data(), "-o", run.to_str().unwrap(), "--preset", "fast", "--timings"], SHORT].concat();
+    let said = String::from_utf8(program().args(args).output().unwrap().stderr).unwrap();
+    let record = read(&run.join("run.json"));
+    let stages: Vec<&str> =
+        record["stages"].as_array().unwrap().iter().map(|time| time["stage"].as_str().unwrap()).collect();
+    assert_eq!(stages, ["read", "device", "calibrate", "plan", "prepare", "iterate", "score", "tree", "report"]);
+    assert!(stages.iter().all(|stage| said.contains(&format!("\n{stage} "))), "{said}");
+    let call = |name: &str| record["calls"][name].as_u64().unwrap();
+    println!("{}", record["calls"]);
+    assert!(said.contains(&format!("{} submits", call("submits"))), "{said}");
+    assert!(call("recordings") <= MAX_RECORDINGS && call("buffers") <= MAX_BUFFERS, "{}", record["calls"]);
+}
+
 #[test]
 fn the_page_tells_of_gaussians_and_their_motion() {
     let dir = tempfile::tempdir().unwrap();

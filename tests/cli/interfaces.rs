@@ -460,6 +460,10 @@ fn measurements_and_baked_views() {
     assert!(report["peaks"]["f32_tflops"].as_f64().unwrap() > 0.0);
     assert_eq!(report["config"]["train"]["rays"], 64);
     assert_eq!((&report["tuning"]["layers"], &report["after"]["iterations"]), (&"f32".into(), &2.into()));
+    let stages: Vec<&str> =
+        report["full"]["stages"].as_array().unwrap().iter().map(|time| time["stage"].as_str().unwrap()).collect();
+    assert_eq!(stages, ["calibrate", "plan", "prepare", "iterate"]);
+    assert!(report["full"]["calls"]["submits"].as_u64().unwrap() > 0);
     // Four iterations at the start, and one that measures their duration.
     assert_eq!(report["after"]["learned"], 5);
     assert!(

@@ -42,7 +42,7 @@ fn interrupted_and_damaged_runs_go_on() {
     assert!(said.contains("intact") && said.contains("remove"), "{said}");
     // Doing what it says continues the run to the same end.
     [last, second].iter().for_each(|file| std::fs::remove_file(file).unwrap());
-    ok(&[&train[..], &["--resume", "--no-eval"]].concat());
+    ok(&["train", "-o", text(&run), "--resume", "--no-eval"]);
     assert!(std::fs::read(last).unwrap() == whole, "the resumed run ends with the same bytes");
 
     // Killed before its first checkpoint, a run starts over with its own configuration, and says so.

@@ -467,7 +467,8 @@ fn names_of_files_do_not_command_the_terminal() {
 
 #[test]
 fn variables_that_hide_drivers_are_named() {
-    for (variable, value) in [("VK_ICD_FILENAMES", "/nowhere/icd.json"), ("VK_DRIVER_FILES", "/nowhere/driver.json")] {
+    let nowhere = [("VK_ICD_FILENAMES", "/nowhere/icd.json"), ("VK_DRIVER_FILES", "/nowhere/driver.json")];
+    for (variable, value) in nowhere.into_iter().chain([("VK_ICD_FILENAMES", ""), ("VK_DRIVER_FILES", "")]) {
         let mut devices = program();
         devices.env_remove("VK_ICD_FILENAMES").env_remove("VK_DRIVER_FILES").env(variable, value);
         let out = devices.args(["phantom", "never made"]).output().unwrap();

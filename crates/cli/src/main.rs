@@ -80,10 +80,14 @@ mod watch;
 
 use clap::Parser;
 use commands::Cli;
+use nertca_vk::error::Result;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(shown) => return show(&shown),
+    };
     tracing_subscriber::fmt()
         .with_writer(std::io::stderr)
         .with_env_filter(tracing_subscriber::EnvFilter::new(if cli.global.verbose {
@@ -94,7 +98,23 @@ fn main() -> ExitCode {
         .without_time()
         .init();
     ignore_file_size_signal();
-    match cli.run().and_then(|()| stdout::finish()) {
+    ended(cli.run().and_then(|()| stdout::finish()))
+}
+
+/// Shows help, the version, or what is wrong with the arguments.
+fn show(shown: &clap::Error) -> ExitCode {
+    if let Err(error) = shown.print() {
+        stdout::keep(error);
+    }
+    match shown.use_stderr() {
+        true => shown.exit_code().try_into().map_or(ExitCode::FAILURE, |code: u8| ExitCode::from(code)),
+        false => ended(stdout::finish()),
+    }
+}
+
+/// Returns the exit code of a command, after its error was told.
+fn ended(outcome: Result<()>) -> ExitCode {
+    match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("nertca-vk: {error}");

@@ -125,7 +125,7 @@ pub fn show_progress() -> impl FnMut(&Event) {
             }
         }
         Event::Evaluation { .. } => evaluation(event),
-        Event::Profile { .. } => (),
+        Event::Profile { .. } | Event::Stage(_) => (),
         Event::Saved { path, .. } => bar.set_message(format!("saved {}", path.display())),
         Event::Finished { step, train_s, dynamic_share, agreement, .. } => {
             bar.finish_and_clear();

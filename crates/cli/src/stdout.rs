@@ -37,7 +37,8 @@ pub fn printable(text: &str) -> Cow<'_, str> {
     Cow::Owned(text.chars().map(escaped).collect())
 }
 
-fn keep(error: std::io::Error) {
+/// Keeps the first error of writing to stdout for [`finish`]; a closed pipe is none.
+pub fn keep(error: std::io::Error) {
     let mut failed = FAILED.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
     if error.kind() != ErrorKind::BrokenPipe && failed.is_none() {
         *failed = Some(error);

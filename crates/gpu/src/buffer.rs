@@ -8,6 +8,7 @@ use ash::vk;
 use bytemuck::Pod;
 use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Kind of memory of a buffer.
@@ -96,6 +97,7 @@ impl Gpu {
         if operands == Operands::Address {
             usage |= vk::BufferUsageFlags::SHADER_DEVICE_ADDRESS;
         }
+        self.shared.calls.buffers.fetch_add(1, Ordering::Relaxed);
         let mut inner = Inner::new(&self.shared, name, bytes)?;
         inner.create(&vk::BufferCreateInfo::default().size(bytes).usage(usage))?;
         inner.allocate(memory)?;

@@ -103,6 +103,45 @@ pub struct Gpu {
     pub(super) shared: Arc<Shared>,
 }
 
+/// Numbers of the host's calls to a device, each of which takes microseconds to milliseconds on a GPU however little work it is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub struct Calls {
+    /// Submits to the queue.
+    pub submits: u64,
+    /// Waits of the host for submits, those that found them complete included.
+    pub waits: u64,
+    /// Command buffers that were recorded.
+    pub recordings: u64,
+    /// Buffers that were made.
+    pub buffers: u64,
+    /// Barriers in submitted commands, at which dispatches wait for earlier ones.
+    pub barriers: u64,
+}
+
+impl Calls {
+    /// Returns the calls since earlier numbers of the same device.
+    #[must_use]
+    pub fn since(&self, earlier: &Calls) -> Calls {
+        Calls {
+            submits: self.submits - earlier.submits,
+            waits: self.waits - earlier.waits,
+            recordings: self.recordings - earlier.recordings,
+            buffers: self.buffers - earlier.buffers,
+            barriers: self.barriers - earlier.barriers,
+        }
+    }
+}
+
+/// Counters of [`Calls`].
+#[derive(Default)]
+pub(super) struct CallCounters {
+    pub(super) submits: AtomicU64,
+    pub(super) waits: AtomicU64,
+    pub(super) recordings: AtomicU64,
+    pub(super) buffers: AtomicU64,
+    pub(super) barriers: AtomicU64,
+}
+
 /// State that every object made from a device keeps alive.
 pub(super) struct Shared {
     pub(super) queue: Mutex<vk::Queue>,
@@ -113,6 +152,7 @@ pub(super) struct Shared {
     pub(super) timeline: vk::Semaphore,
     pub(super) last_submitted: AtomicU64,
     pub(super) live_objects: AtomicU64,
+    pub(super) calls: CallCounters,
     pub(super) info: DeviceInfo,
     looks: PictureRequests,
     /// Pipelines that somebody keeps.
@@ -326,6 +366,7 @@ impl DeviceParts {
             timeline: vk::Semaphore::null(),
             last_submitted: AtomicU64::new(0),
             live_objects: AtomicU64::new(0),
+            calls: CallCounters::default(),
             info,
             looks: PictureRequests::default(),
             kept_pipelines: Mutex::default(),
@@ -461,6 +502,14 @@ impl Gpu {
     /// Returns the shaders whose dispatches were recorded so far, for reports of what was run on a device.
     pub fn recorded_shaders(&self) -> Vec<&'static str> {
         lock(&self.shared.recorded).iter().copied().collect()
+    }
+
+    /// Returns how often the host has called the device since it was opened.
+    pub fn calls(&self) -> Calls {
+        let CallCounters { submits, waits, recordings, buffers, barriers } = &self.shared.calls;
+        let [submits, waits, recordings, buffers, barriers] =
+            [submits, waits, recordings, buffers, barriers].map(|counter| counter.load(Ordering::Relaxed));
+        Calls { submits, waits, recordings, buffers, barriers }
     }
 
     /// Returns the bytes of buffers and images that are alive.

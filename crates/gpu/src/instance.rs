@@ -78,14 +78,18 @@ fn no_instance(code: vk::Result) -> Error {
     })
 }
 
-/// Variables by which the loader uses some drivers only.
-const DRIVER_VARIABLES: [&str; 4] =
-    ["VK_DRIVER_FILES", "VK_ICD_FILENAMES", "VK_LOADER_DRIVERS_SELECT", "VK_LOADER_DRIVERS_DISABLE"];
+/// Variables by which the loader uses some drivers only, and whether it finds none where they are set to an empty text.
+const DRIVER_VARIABLES: [(&str, bool); 4] = [
+    ("VK_DRIVER_FILES", true),
+    ("VK_ICD_FILENAMES", true),
+    ("VK_LOADER_DRIVERS_SELECT", false),
+    ("VK_LOADER_DRIVERS_DISABLE", false),
+];
 
 /// Returns advice for a loader without drivers: variables that hide them, or else packages.
 pub(crate) fn remedy() -> String {
-    let set = |name: &&str| std::env::var_os(name).filter(|value| !value.is_empty());
-    let hiding = DRIVER_VARIABLES.iter().filter_map(|name| Some((name, set(name)?)));
+    let set = |name: &str, also_empty: bool| std::env::var_os(name).filter(|value| also_empty || !value.is_empty());
+    let hiding = DRIVER_VARIABLES.iter().filter_map(|(name, also_empty)| Some((name, set(name, *also_empty)?)));
     let hiding: Vec<String> = hiding.map(|(name, value)| format!("{name}={}", value.to_string_lossy())).collect();
     match hiding.is_empty() {
         true => format!("Install one ({DRIVER_PACKAGES})"),

@@ -152,6 +152,7 @@ impl Recording {
     fn start(gpu: &Gpu, name: &str, timed: Option<u32>) -> Result<Recording> {
         let shared = &gpu.shared;
         shared.track();
+        shared.calls.recordings.fetch_add(1, Ordering::Relaxed);
         // From here on `Commands::drop` cleans up.
         let mut commands = Commands {
             gpu: shared.clone(),
@@ -555,6 +556,7 @@ impl Shared {
         unsafe { self.device.queue_submit(*queue, &submit, vk::Fence::null()) }
             .map_err(Error::vulkan("vkQueueSubmit", name))?;
         self.last_submitted.store(value, Ordering::Release);
+        self.calls.submits.fetch_add(1, Ordering::Relaxed);
         Ok(Ticket(value))
     }
 
@@ -576,6 +578,7 @@ impl Commands {
         // SAFETY: the commands were ended, allow simultaneous use, and wait in their drop for this submit.
         let ticket = unsafe { self.gpu.submit(&work, &self.name) }?;
         self.last_submit.store(ticket.0, Ordering::Release);
+        self.gpu.calls.barriers.fetch_add(self.barriers.into(), Ordering::Relaxed);
         Ok(ticket)
     }
 
@@ -616,6 +619,7 @@ impl Gpu {
     /// # Errors
     /// [`Error::DeviceLost`] or [`Error::Vulkan`].
     pub fn wait(&self, ticket: Ticket) -> Result<()> {
+        self.shared.calls.waits.fetch_add(1, Ordering::Relaxed);
         self.shared.wait(ticket.0)
     }
 }

@@ -129,7 +129,7 @@ impl Workplace<'_> {
                 observe(&StudyEvent::Making { run: id, what, done, of });
             })?;
         let dataset = Dataset::open(&data)?;
-        RunInfo { dataset: data.canonicalize().unwrap_or(data) }.write(&directory)?;
+        RunInfo::new(&data).write(&directory)?;
         let config = study.config(run);
         let tuning = (self.tune)(gpu, &config, &dataset)?;
         let options = RunOptions { run: &directory, resume, stop_at: None, tuning: &tuning, cancel: self.cancel };

@@ -251,11 +251,14 @@ fn run_whole(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning, scr
     let never = AtomicBool::new(false);
     let options = RunOptions { tuning, run: &directory, resume: false, stop_at: None, cancel: &never };
     let (mut curve, mut train_s, mut elapsed_s) = (Vec::new(), 0.0, 0.0);
+    let (mut stages, before) = (Vec::new(), gpu.calls());
     reconstruct(gpu, config, dataset, &options, &mut |event| match event {
         Event::Validation { step, train_s, dice_dynamic, .. } => curve.push((*step, *train_s, *dice_dynamic)),
         Event::Finished { train_s: t, elapsed_s: e, .. } => (train_s, elapsed_s) = (*t, *e),
+        Event::Stage(time) => stages.push(*time),
         _ => {}
     })?;
+    let calls = Some(gpu.calls().since(&before));
     let score = match dataset.validation().is_empty() {
         true => None,
         false => {
@@ -264,7 +267,7 @@ fn run_whole(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning, scr
         }
     };
     let dice = score.as_ref().and_then(|s| s.dice.dynamic);
-    Ok(FullRun { train_s, elapsed_s, curve, dice, psnr: score.map(|s| s.psnr) })
+    Ok(FullRun { train_s, elapsed_s, curve, dice, psnr: score.map(|s| s.psnr), stages, calls })
 }
 
 /// Tells whether iterations do the same work as the paper's, so that a comparison with its 37 minutes is fair whatever the

@@ -13,11 +13,12 @@ use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::{self, Lock};
 use nertca_vk::formats::nrrd;
+use nertca_vk::gpu::device::Calls;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, MANIFEST};
 use nertca_vk::scan::prior::{PRIOR, VesselPrior};
-use nertca_vk_runs::run::events::Event;
+use nertca_vk_runs::run::events::{Event, Stage, StageClock, StageTime};
 use nertca_vk_runs::run::info::RunInfo;
 use nertca_vk_runs::run::prior;
 use nertca_vk_runs::run::reconstruct::{CONFIG, RunOptions, reconstruct};
@@ -30,7 +31,7 @@ use std::sync::Arc;
 /// Arguments of `train`.
 #[derive(Debug, Args)]
 pub struct TrainArgs {
-    /// Dataset directory (native or authors' layout).
+    /// Dataset directory (native or authors' layout); with --resume and --out, by default the one that the run was begun on.
     pub data: Option<PathBuf>,
     /// Run directory; by default the name of DATA with `-run`, in the current directory.
     #[arg(short, long, value_name = "RUN")]
@@ -65,6 +66,9 @@ pub struct TrainArgs {
     /// diameters, and written as `tree.json` beside it.
     #[arg(long)]
     pub tree: bool,
+    /// Print the time of each stage, and the numbers of calls to the device; `run.json` has them as well.
+    #[arg(long)]
+    pub timings: bool,
     /// Start over in a directory that already holds a run.
     #[arg(short, long)]
     pub force: bool,
@@ -100,9 +104,12 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
         out!("{}", config.acting_toml()?.trim_end());
         return Ok(());
     }
-    let Some(data) = &args.data else {
-        clap::Error::raw(ErrorKind::MissingRequiredArgument, NO_DATA).exit();
+    let data = &match (&args.data, &args.out) {
+        (Some(data), _) => data.clone(),
+        (None, Some(run)) if args.resume => RunInfo::read(run)?.dataset,
+        _ => clap::Error::raw(ErrorKind::MissingRequiredArgument, NO_DATA).exit(),
     };
+    let mut clock = StageClock::start();
     let mut dataset = Dataset::open(data)?;
     let prior = prior(args.prior.as_deref(), &config)?;
     let run = &args.out.clone().map_or_else(|| default_run(data), Ok)?;
@@ -119,8 +126,10 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     room_for_training()?;
     dataset.prior = kept_prior(prior, run, args)?;
     let cancel = stop_flag()?;
+    let mut stages = vec![clock.end(Stage::Read)];
     let gpu = global.open_device()?;
-    let info = RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) };
+    stages.push(clock.end(Stage::Device));
+    let mut info = RunInfo::new(&dataset.path);
     if !args.resume {
         info.write(run)?;
     }
@@ -130,6 +139,9 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     let options = RunOptions { tuning: &tuning, run, resume, stop_at: args.stop_at, cancel: &cancel };
     let mut show: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
     let mut observer = |event: &Event| {
+        if let Event::Stage(time) = event {
+            stages.push(*time);
+        }
         if let Event::Started { .. } = event {
             // A run that is resumed keeps its record until the dataset was found to be that of its checkpoint.
             if args.resume {
@@ -141,6 +153,7 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     };
     reconstruct(&gpu, &config, &dataset, &options, &mut observer)?;
     written.replace(Ok(()))?;
+    let mut clock = StageClock::start();
     let dataset = as_trained(dataset, run)?;
     let report = run.join("report");
     let (model, page) = (newest_model(run)?, run.join("report.html"));
@@ -161,6 +174,7 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
         write_scores(&report, &scores)?;
         evaluation = Some(scores);
     }
+    stages.push(clock.end(Stage::Score));
     drop(show);
     let tree = if args.tree {
         tree_of_page(global, (&gpu, &model), (run, &dataset), &cancel, run, &mut warnings)?
@@ -174,6 +188,7 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
         write_scores(&report, scores)?;
         warnings.clone_from(&scores.warnings);
     }
+    stages.push(clock.end(Stage::Tree));
     Report {
         gpu: &gpu,
         tuning: &tuning,
@@ -186,6 +201,12 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
         pictures: &report,
     }
     .write(&page)?;
+    stages.push(clock.end(Stage::Report));
+    (info.stages, info.calls) = (stages, Some(gpu.calls()));
+    info.write(run)?;
+    if args.timings {
+        print_timings(&info);
+    }
     if !args.json {
         if let Some(evaluation) = &evaluation {
             print_table(evaluation);
@@ -195,6 +216,18 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     }
     warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
     global.close_device(&gpu)
+}
+
+/// Prints the stages of a run and its calls to the device to stderr, beside the progress.
+fn print_timings(info: &RunInfo) {
+    for StageTime { stage, seconds } in &info.stages {
+        eprintln!("{:<10} {seconds:9.3} s", stage.name());
+    }
+    if let Some(Calls { submits, waits, recordings, buffers, barriers }) = info.calls {
+        eprintln!(
+            "calls to the device: {submits} submits, {waits} waits, {recordings} recordings, {buffers} buffers made, {barriers} barriers"
+        );
+    }
 }
 
 fn write_scores(report: &Path, scores: &Evaluation) -> Result<()> {

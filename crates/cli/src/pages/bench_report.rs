@@ -4,10 +4,12 @@ use crate::viewer::frame_rates::{FrameRate, print_frame_rates};
 use nertca_vk::bench::PAPER_SECONDS;
 use nertca_vk::bench::peaks::Peaks;
 use nertca_vk::fitting::ledger::{Ledger, StageWork, of_pass};
+use nertca_vk::gpu::device::Calls;
 use nertca_vk::gpu::sensors::{Readings, Span, host_processor};
 use nertca_vk::network::cost::NetworkCost;
 use nertca_vk::train::dry_run::DryRun;
 use nertca_vk::train::timing::{GaussianTiming, Timing};
+use nertca_vk_runs::run::events::StageTime;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -99,6 +101,12 @@ pub struct FullRun {
     pub dice: Option<f64>,
     /// PSNR on all unseen images, dB; none without unseen images.
     pub psnr: Option<f64>,
+    /// Times of its stages up to the last iteration.
+    #[serde(default)]
+    pub stages: Vec<StageTime>,
+    /// Calls of the run to the device, without those of the scores; none in files of earlier versions.
+    #[serde(default)]
+    pub calls: Option<Calls>,
 }
 
 /// Tells whether a pass processes pairs of a Gaussian and a pixel, whose operations are counted.

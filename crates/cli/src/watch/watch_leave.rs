@@ -99,7 +99,7 @@ impl TrainedRun {
             calibration.write(run)?;
         }
         let data = self.write_data(intake, run)?;
-        RunInfo { dataset: data.canonicalize().unwrap_or_else(|_| data.clone()) }.write(run)?;
+        RunInfo::new(&data).write(run)?;
         Report {
             gpu,
             tuning,

@@ -6,6 +6,65 @@ use crate::fitting::losses::StepLoss;
 use crate::gpu::record::PassTime;
 use serde::Serialize;
 use std::path::PathBuf;
+use std::time::Instant;
+
+/// Stage of a run; they are listed in its order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, serde::Deserialize, strum::IntoStaticStr)]
+#[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "snake_case")]
+pub enum Stage {
+    /// The dataset and the prior are read.
+    Read,
+    /// The device is opened.
+    Device,
+    /// Views are compared, calibrated and adjusted.
+    Calibrate,
+    /// Hull, boxes and scales are chosen.
+    Plan,
+    /// Kernels are compiled, data are uploaded, and the fields get their start.
+    Prepare,
+    /// Iterations, with the checkpoints and validations between them.
+    Iterate,
+    /// Unseen images and volumes are scored.
+    Score,
+    /// The vessels are found as a tree.
+    Tree,
+    /// The report is written.
+    Report,
+}
+
+impl Stage {
+    /// Returns its name, as in `run.json`.
+    pub fn name(self) -> &'static str {
+        self.into()
+    }
+}
+
+/// Time of a stage of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, serde::Deserialize)]
+pub struct StageTime {
+    /// The stage.
+    pub stage: Stage,
+    /// Wall time, seconds.
+    pub seconds: f64,
+}
+
+/// Clock of a run's stages, one after the other.
+pub struct StageClock(Instant);
+
+impl StageClock {
+    /// Starts with the first stage.
+    pub fn start() -> StageClock {
+        StageClock(Instant::now())
+    }
+
+    /// Ends a stage, and starts with the next one.
+    pub fn end(&mut self, stage: Stage) -> StageTime {
+        let seconds = self.0.elapsed().as_secs_f64();
+        self.0 = Instant::now();
+        StageTime { stage, seconds }
+    }
+}
 
 /// Event that a run reports to its observer; also a line of `metrics.jsonl`.
 #[derive(Debug, Clone, Serialize)]
@@ -44,6 +103,8 @@ pub enum Event {
         #[serde(flatten)]
         check: Box<Check>,
     },
+    /// A stage of the run has ended; not a line of `metrics.jsonl`.
+    Stage(StageTime),
     /// Adjustment of the views with the field in the loop, before the run starts; not a line of `metrics.jsonl`.
     Adjusting {
         /// Share of the adjustment that is done, 0 to 1.

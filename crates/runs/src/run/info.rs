@@ -1,16 +1,24 @@
-//! Record of a run's inputs.
+//! Record of a run's inputs, and of what it took.
 
 use crate::error::Result;
 use crate::files;
+use crate::gpu::device::Calls;
+use crate::run::events::StageTime;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
-/// Record of a run's inputs: `run.json`.
+/// Record of a run's inputs, and of what it took: `run.json`.
 #[derive(Debug, Clone, Serialize, serde::Deserialize)]
 pub struct RunInfo {
     /// Dataset of the training; where its path is not text in UTF-8, the file holds its bytes.
     #[serde(with = "files::path_in_json")]
     pub dataset: PathBuf,
+    /// Stages of the process that trained last, once it has ended.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub stages: Vec<StageTime>,
+    /// Calls of that process to its device.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub calls: Option<Calls>,
 }
 
 /// Largest accepted size of the file.
@@ -18,6 +26,12 @@ const MAX_BYTES: u64 = 1 << 20;
 
 impl RunInfo {
     const FILE: &str = "run.json";
+
+    /// Returns the record of a run that begins on a dataset.
+    pub fn new(dataset: &Path) -> RunInfo {
+        let dataset = dataset.canonicalize().unwrap_or_else(|_| dataset.to_owned());
+        RunInfo { dataset, stages: Vec::new(), calls: None }
+    }
 
     /// Writes the record into a run directory.
     ///

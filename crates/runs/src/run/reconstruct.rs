@@ -19,7 +19,7 @@ use crate::methods;
 use crate::plan::Plan;
 use crate::prepare::Prepared;
 use crate::run::curve::{VALIDATION_IMAGES, thinned, validation_step};
-use crate::run::events::Event;
+use crate::run::events::{Event, Stage, StageClock};
 use crate::run::log::MetricsLog;
 use crate::run::snapshots::{Answer, Job, SnapshotWorker};
 use crate::run::{hull_pictures, silhouette_pictures};
@@ -86,12 +86,15 @@ pub fn reconstruct(
             together_mib: mib(memory.together_bytes),
         });
     }
+    let mut clock = StageClock::start();
     let checked = if options.resume { None } else { checked(dataset) };
     let Calibrated { dataset, carried, calibration, made } = calibrated(gpu, config, dataset, options, observe)?;
     let dataset = &dataset;
+    observe(&Event::Stage(clock.end(Stage::Calibrate)));
     let trainer = if options.resume {
         let saved = Checkpoint::read(&checkpoint::newest(options.run)?)?;
         let plan = Plan::new(&saved.model.config, dataset)?.in_scene(saved.model.scene.clone());
+        observe(&Event::Stage(clock.end(Stage::Plan)));
         Trainer::resume(gpu, plan, dataset, options.tuning.clone(), &saved)?
     } else {
         // What is wrong with the views is often the reason why there is nothing to plan.
@@ -99,6 +102,7 @@ pub fn reconstruct(
         if let Some(hull) = &plan.hull {
             hull_pictures::write(&options.run.join("report"), dataset, hull)?;
         }
+        observe(&Event::Stage(clock.end(Stage::Plan)));
         let from = Start { made: made.as_ref(), ..Start::default() };
         Trainer::begin(gpu, plan, dataset, options.tuning.clone(), from)?
     };
@@ -139,6 +143,7 @@ pub fn reconstruct(
         notes,
     })?;
     checked.map_or(Ok(()), &mut tell)?;
+    let prepared = clock.end(Stage::Prepare);
     let mut training = Training::new(trainer);
     let begin = Instant::now();
     let worker = SnapshotWorker {
@@ -158,7 +163,9 @@ pub fn reconstruct(
         let (done, answers) = channel::<Answer>();
         scope.spawn(move || worker.work(&to_do, &done));
         Loop::new(&mut training, &config, options, &mut tell).run(jobs, &answers)
-    })
+    })?;
+    [prepared, clock.end(Stage::Iterate)].into_iter().for_each(|time| observe(&Event::Stage(time)));
+    Ok(())
 }
 
 /// Compares the views; `None` where too few of them show what moves.
