@@ -3,7 +3,7 @@
 
 use crate::error::{Error, Result};
 use std::collections::BTreeSet;
-use std::fs::File;
+use std::fs::{File, TryLockError};
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -159,31 +159,15 @@ fn write_in_place<E: From<Error>>(
 #[cfg(unix)]
 fn hold(file: &File) {
     // A file system without locks gives no protection against a second process in the same directory.
-    let _ = rustix::fs::flock(file, rustix::fs::FlockOperation::LockExclusive);
+    let _ = file.lock();
 }
 
 #[cfg(not(unix))]
 fn hold(_: &File) {}
 
-/// Tries to lock an open file and tells whether that worked; none where the file system has no locks.
-#[cfg(unix)]
-fn try_hold(file: &File) -> Option<bool> {
-    use rustix::fs::{FlockOperation, flock};
-    match flock(file, FlockOperation::NonBlockingLockExclusive) {
-        Ok(()) => Some(true),
-        Err(rustix::io::Errno::WOULDBLOCK) => Some(false),
-        Err(_) => None,
-    }
-}
-
-#[cfg(not(unix))]
-fn try_hold(_: &File) -> Option<bool> {
-    None
-}
-
 /// Tells whether some process still writes a file. Without locks this is unknown, and only Unix removes files that are open.
 fn is_held(file: &File) -> bool {
-    cfg!(unix) && try_hold(file) != Some(true)
+    cfg!(unix) && file.try_lock().is_err()
 }
 
 /// Removes the partial files that killed processes have left in a directory, and returns their number. Files that other
@@ -199,10 +183,12 @@ pub fn remove_partial(directory: &Path) -> usize {
 }
 
 /// A lock file that one process at a time holds for as long as this value lives; the operating system releases it when a
-/// process is killed. Systems and file systems without such locks keep nobody out.
+/// process is killed. On a file system without locks, a second file names the process instead.
 #[derive(Debug)]
 pub struct Lock {
     _file: File,
+    /// File that names this process, where there are no locks.
+    record: Option<PathBuf>,
 }
 
 impl Lock {
@@ -213,7 +199,83 @@ impl Lock {
     pub fn take(path: &Path) -> Result<Option<Lock>> {
         create_directory(path.parent().unwrap_or(Path::new(".")))?;
         let file = File::create(path).map_err(Error::io("create", path))?;
-        Ok(if try_hold(&file) == Some(false) { None } else { Some(Lock { _file: file }) })
+        match file.try_lock() {
+            Ok(()) => Ok(Some(Lock { _file: file, record: None })),
+            Err(TryLockError::WouldBlock) => Ok(None),
+            // NFS and Lustre may have no locks, and fail with ENOLCK or ENOSYS.
+            Err(TryLockError::Error(_)) => Lock::by_record(path, file),
+        }
+    }
+
+    /// Takes the lock by a file that names this process, `NAME.process` for a lock file `NAME`. It stays behind where a process is killed,
+    /// and counts no longer when that process has ended; of a process on another computer this is unknown.
+    fn by_record(path: &Path, file: File) -> Result<Option<Lock>> {
+        let mut name = path.as_os_str().to_owned();
+        name.push(".process");
+        let record = PathBuf::from(name);
+        let process = Process::this();
+        loop {
+            match File::options().write(true).create_new(true).open(&record) {
+                Ok(mut file) => {
+                    file.write_all(process.to_text().as_bytes()).map_err(Error::io("write", &record))?;
+                    break;
+                }
+                Err(e) if e.kind() == std::io::ErrorKind::AlreadyExists => {
+                    let text = read_text(&record, MAX_RECORD_BYTES)?;
+                    if Process::of_text(&text).is_none_or(|holder| holder.may_run()) {
+                        return Ok(None);
+                    }
+                    std::fs::remove_file(&record).map_err(Error::io("remove", &record))?;
+                }
+                Err(e) => return Err(Error::io("create", &record)(e)),
+            }
+        }
+        Ok(Some(Lock { _file: file, record: Some(record) }))
+    }
+
+    /// Returns the file that names this process, where the file system has no locks.
+    pub fn record(&self) -> Option<&Path> {
+        self.record.as_deref()
+    }
+}
+
+impl Drop for Lock {
+    fn drop(&mut self) {
+        // A file that cannot be removed names a process that has ended.
+        self.record.iter().for_each(|record| drop(std::fs::remove_file(record)));
+    }
+}
+
+/// Largest accepted size of the file that names a process.
+const MAX_RECORD_BYTES: u64 = 4096;
+
+/// Process that holds a lock without the help of the file system.
+#[derive(Debug, PartialEq)]
+struct Process {
+    host: String,
+    id: u32,
+}
+
+impl Process {
+    fn this() -> Process {
+        let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+        Process { host: host.trim().to_owned(), id: std::process::id() }
+    }
+
+    fn to_text(&self) -> String {
+        format!("{} {}\n", self.id, self.host)
+    }
+
+    fn of_text(text: &str) -> Option<Process> {
+        let (id, host) = text.trim_end_matches('\n').split_once(' ')?;
+        Some(Process { id: id.parse().ok()?, host: host.to_owned() })
+    }
+
+    /// Tells whether the process still runs, as far as this computer knows.
+    fn may_run(&self) -> bool {
+        let processes = Path::new("/proc");
+        let is_known = self.host == Process::this().host && processes.join("self").exists();
+        !is_known || processes.join(self.id.to_string()).exists()
     }
 }
 
@@ -372,6 +434,26 @@ mod tests {
         assert!(Lock::take(&path).unwrap().is_none());
         drop(held);
         assert!(Lock::take(&path).unwrap().is_some());
+    }
+
+    #[test]
+    fn one_at_a_time_has_a_lock_where_the_file_system_has_none() {
+        let directory = tempfile::tempdir().unwrap();
+        let (path, record) = (directory.path().join("one"), directory.path().join("one.process"));
+        let take = || Lock::by_record(&path, File::create(&path).unwrap()).unwrap();
+        let held = take().unwrap();
+        assert_eq!(held.record(), Some(&*record));
+        assert!(take().is_none());
+        drop(held);
+        assert!(!record.exists());
+        // A process that was killed leaves its file, and one on another computer may run.
+        let Process { host, .. } = Process::this();
+        std::fs::write(&record, Process { host: host.clone(), id: u32::MAX }.to_text()).unwrap();
+        assert_eq!(take().is_some(), cfg!(target_os = "linux"));
+        for text in [Process { host: format!("{host}-2"), id: u32::MAX }.to_text(), "of somebody else".into()] {
+            std::fs::write(&record, text).unwrap();
+            assert!(take().is_none());
+        }
     }
 
     #[cfg(unix)]

@@ -239,10 +239,24 @@ pub(crate) const LOCK: &str = "train.lock";
 
 /// Takes a run directory for this process, so that two trainings, or a training and a watch, do not mix their files in it.
 pub(crate) fn take_run(run: &Path) -> Result<Lock> {
-    Lock::take(&run.join(LOCK))?.ok_or_else(|| {
+    let lock = Lock::take(&run.join(LOCK))?.ok_or_else(|| {
         let problem = "another process trains into this run directory: wait for it, or choose another --out";
-        Error::Busy(format!("{}: {problem}", run.display()))
-    })
+        let record = run.join(format!("{LOCK}.process"));
+        let stale = match record.exists() {
+            true => format!("; where no such process runs on any computer, remove {}", record.display()),
+            false => String::new(),
+        };
+        Error::Busy(format!("{}: {problem}{stale}", run.display()))
+    })?;
+    if let Some(record) = lock.record() {
+        eprintln!(
+            "warning: {}: the file system has no locks; {} keeps other processes out instead, and must be removed by hand where this \
+             computer fails during the run",
+            run.display(),
+            record.display()
+        );
+    }
+    Ok(lock)
 }
 
 /// Returns the configuration of a run that is to be resumed, for which the paths are chosen, and whether there is a checkpoint to
