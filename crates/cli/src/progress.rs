@@ -39,6 +39,10 @@ pub fn clean_up_on_signals() -> Result<()> {
 
 /// Prints an event as one line of JSON on stdout.
 pub fn print_json(event: &Event) {
+    // Stages before the start are known before a consumer expects anything; `run.json` has them all.
+    if matches!(event, Event::Stage(_)) {
+        return;
+    }
     if let Ok(line) = serde_json::to_string(event) {
         out!("{line}");
     }

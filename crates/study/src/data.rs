@@ -239,6 +239,14 @@ impl Source {
         take_in(&mut fingerprint, path)?;
         Ok(Source::Directory { path: path.to_path_buf(), fingerprint })
     }
+
+    /// Tells whether the training views may show a catheter: that of a directory is not known.
+    pub fn may_show_catheter(&self) -> bool {
+        match self {
+            Source::Phantom(phantom) => phantom.options.degradations.catheter,
+            Source::Directory { .. } => true,
+        }
+    }
 }
 
 /// Adds a file to a fingerprint, or all files of a directory with their names, sorted by name.

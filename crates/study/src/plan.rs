@@ -62,8 +62,18 @@ pub struct Run {
 /// Line of a setting that was added when results had been recorded, and that changes nothing.
 const ADDED: &str = "without_rules = []\n";
 
-/// Leaves out what recorded results did not state, so that these keep their fingerprint.
-fn as_before(settings: &str) -> String {
+/// Default treatment of a catheter.
+const CATHETER: &str = "catheter = \"auto\"\n";
+/// Beginning of the line before which recorded results have their default treatment of a catheter, and what they state there.
+const BEFORE_RULES: [&str; 2] = ["without_rules = ", "without_catheter = false\nwithout_rules = "];
+
+/// Writes settings as recorded results state them, so that these keep their fingerprint. `shows_catheter` tells whether the data may show a
+/// catheter; both defaults do the same without one.
+fn as_before(settings: &str, shows_catheter: bool) -> String {
+    let [line, with_catheter] = BEFORE_RULES;
+    let is_default = settings.contains(CATHETER) && !shows_catheter;
+    let settings =
+        if is_default { settings.replace(CATHETER, "").replace(line, with_catheter) } else { settings.into() };
     settings.replace(ADDED, "")
 }
 
@@ -124,9 +134,10 @@ impl Study {
     /// # Errors
     /// [`Error::Internal`] for a configuration that cannot be written as TOML.
     pub fn fingerprint(&self, run: &Run) -> Result<RunFingerprint> {
+        let (data, settings) = (&self.data[run.data], self.config(run).acting_toml()?);
         Ok(RunFingerprint {
-            data: self.data[run.data].fingerprint(run.seed),
-            configuration: Fingerprint::of(as_before(&self.config(run).acting_toml()?).as_bytes()).hex(),
+            data: data.fingerprint(run.seed),
+            configuration: Fingerprint::of(as_before(&settings, data.source.may_show_catheter()).as_bytes()).hex(),
             commit: COMMIT.to_owned(),
         })
     }
