@@ -39,10 +39,6 @@ pub fn clean_up_on_signals() -> Result<()> {
 
 /// Prints an event as one line of JSON on stdout.
 pub fn print_json(event: &Event) {
-    // Stages before the start are known before a consumer expects anything; `run.json` has them all.
-    if matches!(event, Event::Stage(_)) {
-        return;
-    }
     if let Ok(line) = serde_json::to_string(event) {
         out!("{line}");
     }
@@ -129,7 +125,7 @@ pub fn show_progress() -> impl FnMut(&Event) {
             }
         }
         Event::Evaluation { .. } => evaluation(event),
-        Event::Profile { .. } | Event::Stage(_) => (),
+        Event::Profile { .. } => (),
         Event::Saved { path, .. } => bar.set_message(format!("saved {}", path.display())),
         Event::Finished { step, train_s, dynamic_share, agreement, .. } => {
             bar.finish_and_clear();

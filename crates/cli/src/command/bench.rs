@@ -254,8 +254,10 @@ fn run_whole(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning, scr
     let (mut stages, before) = (Vec::new(), gpu.calls());
     reconstruct(gpu, config, dataset, &options, &mut |event| match event {
         Event::Validation { step, train_s, dice_dynamic, .. } => curve.push((*step, *train_s, *dice_dynamic)),
-        Event::Finished { train_s: t, elapsed_s: e, .. } => (train_s, elapsed_s) = (*t, *e),
-        Event::Stage(time) => stages.push(*time),
+        Event::Finished { train_s: t, elapsed_s: e, stages: s, .. } => {
+            (train_s, elapsed_s) = (*t, *e);
+            stages.clone_from(s);
+        }
         _ => {}
     })?;
     let calls = Some(gpu.calls().since(&before));

@@ -139,8 +139,8 @@ pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     let options = RunOptions { tuning: &tuning, run, resume, stop_at: args.stop_at, cancel: &cancel };
     let mut show: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
     let mut observer = |event: &Event| {
-        if let Event::Stage(time) = event {
-            stages.push(*time);
+        if let Event::Finished { stages: of_run, .. } = event {
+            stages.extend(of_run);
         }
         if let Event::Started { .. } = event {
             // A run that is resumed keeps its record until the dataset was found to be that of its checkpoint.

@@ -103,8 +103,6 @@ pub enum Event {
         #[serde(flatten)]
         check: Box<Check>,
     },
-    /// A stage of the run has ended; not a line of `metrics.jsonl`.
-    Stage(StageTime),
     /// Adjustment of the views with the field in the loop, before the run starts; not a line of `metrics.jsonl`.
     Adjusting {
         /// Share of the adjustment that is done, 0 to 1.
@@ -212,5 +210,7 @@ pub enum Event {
         /// Loss of the dynamic network as a share of the loss without one; `None` for dynamic Gaussians.
         #[serde(skip_serializing_if = "Option::is_none")]
         dynamic_share: Option<f64>,
+        /// Times of the stages from [`Stage::Calibrate`] to [`Stage::Iterate`].
+        stages: Vec<StageTime>,
     },
 }

@@ -19,7 +19,7 @@ use crate::methods;
 use crate::plan::Plan;
 use crate::prepare::Prepared;
 use crate::run::curve::{VALIDATION_IMAGES, thinned, validation_step};
-use crate::run::events::{Event, Stage, StageClock};
+use crate::run::events::{Event, Stage, StageClock, StageTime};
 use crate::run::log::MetricsLog;
 use crate::run::snapshots::{Answer, Job, SnapshotWorker};
 use crate::run::{hull_pictures, silhouette_pictures};
@@ -86,15 +86,15 @@ pub fn reconstruct(
             together_mib: mib(memory.together_bytes),
         });
     }
-    let mut clock = StageClock::start();
+    let (mut clock, mut stages) = (StageClock::start(), Vec::new());
     let checked = if options.resume { None } else { checked(dataset) };
     let Calibrated { dataset, carried, calibration, made } = calibrated(gpu, config, dataset, options, observe)?;
     let dataset = &dataset;
-    observe(&Event::Stage(clock.end(Stage::Calibrate)));
+    stages.push(clock.end(Stage::Calibrate));
     let trainer = if options.resume {
         let saved = Checkpoint::read(&checkpoint::newest(options.run)?)?;
         let plan = Plan::new(&saved.model.config, dataset)?.in_scene(saved.model.scene.clone());
-        observe(&Event::Stage(clock.end(Stage::Plan)));
+        stages.push(clock.end(Stage::Plan));
         Trainer::resume(gpu, plan, dataset, options.tuning.clone(), &saved)?
     } else {
         // What is wrong with the views is often the reason why there is nothing to plan.
@@ -102,7 +102,7 @@ pub fn reconstruct(
         if let Some(hull) = &plan.hull {
             hull_pictures::write(&options.run.join("report"), dataset, hull)?;
         }
-        observe(&Event::Stage(clock.end(Stage::Plan)));
+        stages.push(clock.end(Stage::Plan));
         let from = Start { made: made.as_ref(), ..Start::default() };
         Trainer::begin(gpu, plan, dataset, options.tuning.clone(), from)?
     };
@@ -143,7 +143,7 @@ pub fn reconstruct(
         notes,
     })?;
     checked.map_or(Ok(()), &mut tell)?;
-    let prepared = clock.end(Stage::Prepare);
+    stages.push(clock.end(Stage::Prepare));
     let mut training = Training::new(trainer);
     let begin = Instant::now();
     let worker = SnapshotWorker {
@@ -162,10 +162,8 @@ pub fn reconstruct(
         let (jobs, to_do) = sync_channel::<Job>(2);
         let (done, answers) = channel::<Answer>();
         scope.spawn(move || worker.work(&to_do, &done));
-        Loop::new(&mut training, &config, options, &mut tell).run(jobs, &answers)
-    })?;
-    [prepared, clock.end(Stage::Iterate)].into_iter().for_each(|time| observe(&Event::Stage(time)));
-    Ok(())
+        Loop::new(&mut training, &config, options, (clock, stages), &mut tell).run(jobs, &answers)
+    })
 }
 
 /// Compares the views; `None` where too few of them show what moves.
@@ -226,6 +224,9 @@ struct Loop<'a> {
     config: &'a Config,
     options: &'a RunOptions<'a>,
     tell: &'a mut dyn FnMut(Event) -> Result<()>,
+    /// Clock of the stages, and those that have ended.
+    clock: StageClock,
+    stages: Vec<StageTime>,
     first_step: u32,
     end: u32,
     /// Jobs the worker has not finished.
@@ -239,6 +240,7 @@ impl<'a> Loop<'a> {
         training: &'a mut Training,
         config: &'a Config,
         options: &'a RunOptions<'a>,
+        (clock, stages): (StageClock, Vec<StageTime>),
         tell: &'a mut dyn FnMut(Event) -> Result<()>,
     ) -> Loop<'a> {
         Loop {
@@ -250,6 +252,8 @@ impl<'a> Loop<'a> {
             config,
             options,
             tell,
+            clock,
+            stages,
         }
     }
 
@@ -297,7 +301,8 @@ impl<'a> Loop<'a> {
         let (train_s, dynamic_share) = (self.training.train_s(), self.dynamic_share);
         let agreement = self.training.trainer().outline().gaussians;
         let agreement = agreement.and_then(|field| field.rows().agreement.as_ref().map(|fits| fits.overall));
-        (self.tell)(Event::Finished { agreement, step, train_s, elapsed_s, dynamic_share })
+        self.stages.push(self.clock.end(Stage::Iterate));
+        (self.tell)(Event::Finished { agreement, step, train_s, elapsed_s, dynamic_share, stages: self.stages })
     }
 
     fn cancelled(&self) -> bool {
