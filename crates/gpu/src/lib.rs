@@ -2,6 +2,7 @@
 //! the configuration of its callers; its errors name objects and limits of the device, and callers add what can be changed.
 
 pub mod buffer;
+pub mod calls;
 pub mod capabilities;
 pub mod details;
 pub mod device;

@@ -13,7 +13,7 @@ use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::{self, Lock};
 use nertca_vk::formats::nrrd;
-use nertca_vk::gpu::device::Calls;
+use nertca_vk::gpu::calls::Calls;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, MANIFEST};

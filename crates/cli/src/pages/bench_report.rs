@@ -4,7 +4,7 @@ use crate::viewer::frame_rates::{FrameRate, print_frame_rates};
 use nertca_vk::bench::PAPER_SECONDS;
 use nertca_vk::bench::peaks::Peaks;
 use nertca_vk::fitting::ledger::{Ledger, StageWork, of_pass};
-use nertca_vk::gpu::device::Calls;
+use nertca_vk::gpu::calls::Calls;
 use nertca_vk::gpu::sensors::{Readings, Span, host_processor};
 use nertca_vk::network::cost::NetworkCost;
 use nertca_vk::train::dry_run::DryRun;

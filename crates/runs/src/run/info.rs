@@ -2,7 +2,7 @@
 
 use crate::error::Result;
 use crate::files;
-use crate::gpu::device::Calls;
+use crate::gpu::calls::Calls;
 use crate::run::events::StageTime;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
