@@ -96,7 +96,7 @@ fn runs_without_vessels_are_told_when_they_begin_and_when_the_field_vanishes() {
     assert!(vanished.contains(wide), "{vanished}");
     let zero = "warning: after 40 iterations the dynamic field is zero everywhere";
     assert_eq!(vanished.matches(zero).count(), 1, "{vanished}");
-    assert!(!vanished.contains("after 60 iterations the dynamic"), "it is told once: {vanished}");
+    assert!(!vanished.contains("after 60 iterations the dynamic"), "the warning comes once: {vanished}");
     let lives = said("lives", &["--preset", "nert-ca"]);
     assert!(!lives.contains("warning: the box") && !lives.contains("is zero everywhere"), "{lives}");
 }

@@ -112,7 +112,7 @@ fn show(shown: &clap::Error) -> ExitCode {
     }
 }
 
-/// Returns the exit code of a command, after its error was told.
+/// Prints the error of a command, if it has one, and returns its exit code.
 fn ended(outcome: Result<()>) -> ExitCode {
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

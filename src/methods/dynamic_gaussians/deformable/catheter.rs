@@ -35,7 +35,8 @@ const NEXT: f64 = 4.0;
 
 /// Width up to which a structure is taken for a catheter, mm: twice that of the widest one for coronary arteries, 8 French.
 const MAX_WIDTH_MM: f64 = 5.4;
-/// Contrast that a catheter has at least on its way to the border, as a share of its contrast at the end that rests.
+/// Contrast that a catheter has at least on its way to the border, as a share of its contrast at the end that rests: three data sets with a
+/// catheter have .52 to 1 in their eleven views. Without a catheter, the slowest Gaussians of three data sets have less, but for one view.
 const CONTRAST_ON_THE_WAY: f32 = 0.5;
 
 /// Catheter in a deformable set.

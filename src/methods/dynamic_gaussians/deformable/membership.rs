@@ -13,7 +13,8 @@ use glam::DVec3;
 
 /// Minimum filling at the phases whose images decide where new Gaussians are placed.
 const MOSTLY_FILLED: f64 = 0.5;
-/// Views in which a catheter must come from the border of the image: one alone may show an edge of a bone there.
+/// Number of views in which a catheter must come from the border of the image: one alone may show an edge of a bone there, as was seen in one
+/// of three data sets without a catheter.
 const MIN_VIEWS_ENTERED: usize = 2;
 
 impl DeformableTrainer {
